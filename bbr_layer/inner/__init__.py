@@ -1,0 +1,1 @@
+"""The inner optimisers and what they move."""

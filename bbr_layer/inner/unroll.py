@@ -1,0 +1,159 @@
+"""The inner registration itself: one step, and the steps of one stage."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bbr_layer.geometry import RigidMotion
+from bbr_layer.inner.adam import Adam, Moments, adam_direction
+from bbr_layer.inner.charts import Chart, State, tangent_zero
+from bbr_layer.loss_base import Objective
+from bbr_layer.pair import Frame
+from bbr_layer.rotations import rotation_dimensions
+from bbr_layer.temperature import Temperature
+
+# Share of the steps, at the end, over which a registration must have settled to count as converged.
+SETTLED_TAIL = 0.1
+
+
+class Problem(NamedTuple):
+    """What one stage minimises, and how: everything that stays the same from step to step."""
+
+    objective: Objective
+    chart: Chart
+    frame: Frame
+    temperature: Temperature
+    unit: Tensor  # (batch,) float64, the spacing that temperatures are multiples of
+    inner: Adam
+
+
+class Progress(NamedTuple):
+    """Where a stage stands: everything that changes from step to step."""
+
+    state: State
+    temperature: Tensor  # (batch,) float64, inner units
+    moments: Moments
+    gradient_norm: Tensor  # (batch,) of the last step taken
+    best_loss: Tensor  # (batch,)
+    best_state: State
+    best_temperature: Tensor
+
+    def detach(self) -> "Progress":
+        """The same numbers, cut from the graph."""
+        return Progress(
+            _detached(self.state),
+            self.temperature.detach(),
+            self.moments.detach(),
+            self.gradient_norm,
+            self.best_loss.detach(),
+            _detached(self.best_state),
+            self.best_temperature.detach(),
+        )
+
+
+def begin(problem: Problem, start: RigidMotion) -> Progress:
+    """Before the first step, at ``start`` (between the user's frames)."""
+    state = problem.chart.begin(start, problem.frame)
+    scale = problem.frame.scale
+    temperature = problem.temperature.initial(problem.unit, scale).expand(scale.shape)
+    batch, d = start.translation.shape
+    size = rotation_dimensions(d) + d + int(problem.temperature.learned)
+    moments = Moments.zero(torch.zeros(batch, size, dtype=torch.float64, device=scale.device))
+    infinite = torch.full_like(scale.detach(), torch.inf)
+    return Progress(state, temperature, moments, infinite, infinite, state, temperature)
+
+
+def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
+    """One step of Adam on pose and, if it is learned, temperature; ``differentiable`` keeps the graph."""
+    inner, learned = problem.inner, problem.temperature.learned
+    temperature = at.temperature
+    if not learned:
+        temperature = problem.temperature.at(_done(at.moments.step, inner.steps), problem.unit)
+    loss, gradient = loss_gradient(problem, at.state, temperature, differentiable)
+    d = problem.frame.target_centre.shape[-1]
+    blocks = (rotation_dimensions(d), d) + ((1,) if learned else ())
+    direction, moments = adam_direction(
+        gradient, at.moments, betas=inner.betas, eps=inner.eps, blocks=blocks if inner.shared else None
+    )
+    move = -inner.rates(blocks, direction, at.moments.step) * direction
+    pose_size = blocks[0] + blocks[1]
+    state = problem.chart.moved(at.state, move[:, :pose_size])
+    later = torch.maximum(temperature + move[:, -1], _floor(problem)) if learned else temperature
+    better = (loss < at.best_loss).detach()
+    return Progress(
+        state,
+        later,
+        moments,
+        gradient[:, :pose_size].detach().norm(dim=-1),
+        torch.where(better, loss, at.best_loss),
+        _chosen(better, at.state, at.best_state),
+        torch.where(better, temperature, at.best_temperature),
+    )
+
+
+def loss_gradient(problem: Problem, state: State, temperature: Tensor, differentiable: bool) -> tuple[Tensor, Tensor]:
+    """Loss ``(batch,)`` and its gradient ``(batch, k)`` in the pose's tangent at 0 and, if learned, the temperature."""
+    batch, d = problem.frame.target_centre.shape
+    with torch.enable_grad():
+        tangent = tangent_zero(batch, d, temperature.device).requires_grad_()
+        warmth = torch.zeros_like(temperature).requires_grad_()
+        motion = problem.chart.motion(problem.chart.moved(state, tangent), problem.frame)
+        loss = problem.objective(motion, torch.maximum(temperature + warmth, _floor(problem)))
+        leaves = (tangent, warmth) if problem.temperature.learned else (tangent,)
+        gradients = torch.autograd.grad(loss.sum(), leaves, create_graph=differentiable, materialize_grads=True)
+    columns = [gradients[0]] + [g[:, None] for g in gradients[1:]]
+    return loss if differentiable else loss.detach(), torch.cat(columns, dim=-1)
+
+
+def run(
+    problem: Problem, start: RigidMotion, attached: Callable[[int], bool], detached: Problem
+) -> tuple[Progress, State]:
+    """All steps of a stage, and the state a tenth of the steps before the end (to tell whether it settled).
+
+    Parameters
+    ----------
+    attached: says of each step whether it is kept differentiable.
+    problem, detached: the stage, and the same one with every input cut from the graph, for the other steps.
+    """
+    at = begin(problem, start)
+    tail = math.floor((1 - SETTLED_TAIL) * problem.inner.steps)
+    for number in range(problem.inner.steps):
+        if number == tail:
+            earlier = _detached(at.state)
+        if attached(number):
+            if number and not attached(number - 1):
+                at = at._replace(state=_fixed(at.state, problem, detached))
+            at = step(problem, at, differentiable=True)
+        else:
+            with torch.no_grad():
+                at = step(detached, at.detach(), differentiable=False)
+    if problem.inner.keep == "best":
+        at = at._replace(state=at.best_state, temperature=at.best_temperature)
+    return at, earlier
+
+
+def _fixed(state: State, problem: Problem, detached: Problem) -> State:
+    """A pose found without a graph, as one that stays put in the user's frame while the clouds' centres vary."""
+    motion = detached.frame.leave(problem.chart.motion(state, detached.frame))
+    return problem.chart.begin(motion, problem.frame)
+
+
+def _floor(problem: Problem) -> Tensor:
+    return problem.temperature.floor(problem.frame.scale)
+
+
+def _done(step: int, steps: int) -> float:
+    """Share of the steps done, so that the schedule's end is met at the last one."""
+    return step / max(steps - 1, 1)
+
+
+def _detached(state: State) -> State:
+    return State(*(field.detach() for field in state))
+
+
+def _chosen(which: Tensor, first: State, second: State) -> State:
+    fields = zip(first, second, strict=True)
+    return State(*(torch.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in fields))

@@ -1,0 +1,148 @@
+"""The paper's four losses, one small class each; all are minimised and answer one number per pair of clouds.
+
+A loss is called with a ``CloudPair`` whose source has been moved, and a temperature ``(batch,)``.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bbr_layer.buddies import OUTLIER_CONSTANT
+from bbr_layer.distances import matched_plane_normals, point_to_point, smooth_root, symmetric_point_to_plane
+from bbr_layer.geometry import RigidMotion
+from bbr_layer.loss_base import Loss, Objective, SoftLoss, weighted_mean
+from bbr_layer.neighbours import MutualNeighbours
+from bbr_layer.pair import CloudPair
+
+
+class SoftBBS(SoftLoss):
+    """Eq. 5: minus the sum of soft buddies. The widest basin and the least accurate of the four.
+
+    Parameters
+    ----------
+    smoothing: in point spacings, see ``Loss``. Default 0.
+    outlier: the epsilon of Eq. 4. Default 1e-10.
+    match: what buddies are found by: ``"points"``, ``"both"`` (coordinates and features side by side), or
+        ``"auto"`` (default): both when features are given.
+    feature_weight: inner length units per unit of feature distance. Default 1: a feature distance of 1 counts as
+        much as one cloud radius (in the layer's scaled frame; one data unit in the paper's).
+
+    Raises
+    ------
+    ValueError: ``match="features"``: the sum would not depend on the pose; negative or unknown settings.
+    """
+
+    def __init__(
+        self,
+        *,
+        smoothing: float = 0.0,
+        outlier: float = OUTLIER_CONSTANT,
+        match: str = "auto",
+        feature_weight: float = 1.0,
+    ):
+        super().__init__(smoothing=smoothing, outlier=outlier, match=match, feature_weight=feature_weight)
+        if match == "features":
+            raise ValueError("match='features' leaves softBBS without a pose to find: use match='both', or SoftBD")
+
+    def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
+        distances = point_to_point(pair, self.rounding(pair))
+        return -self.buddies(pair, distances, temperature).sum((-1, -2), dtype=torch.float64)
+
+
+class SoftBD(SoftLoss):
+    """Eq. 6: the mean distance between soft buddies, weighted by how much they are buddies.
+
+    Parameters as for ``SoftBBS``; with ``match="features"`` buddies are found by features alone and the loss is
+    their distance in space.
+    """
+
+    def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
+        distances = point_to_point(pair, self.rounding(pair))
+        return weighted_mean(distances, self.buddies(pair, distances, temperature))
+
+
+class SoftBDNormals(SoftLoss):
+    """N: Eq. 6 on the symmetric point-to-plane distance of Eq. 7, for the buddies and for the mean.
+
+    Parameters
+    ----------
+    smoothing, outlier: as for ``SoftBBS``.
+    align_signs: turn normals of opposite sides before adding them. Default True; the printed equation does not.
+    clip: squared distances are clipped at this many standard deviations above their mean, as the authors' code
+        does; None (default, the printed equation) clips nothing.
+    """
+
+    needs_normals = True
+
+    def __init__(
+        self,
+        *,
+        smoothing: float = 0.0,
+        outlier: float = OUTLIER_CONSTANT,
+        align_signs: bool = True,
+        clip: float | None = None,
+    ):
+        super().__init__(smoothing=smoothing, outlier=outlier, match="points")
+        self.align_signs, self.clip = align_signs, clip
+
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, align_signs={self.align_signs}, clip={self.clip}".replace(
+            ", match='points', feature_weight=1.0", ""
+        )
+
+    def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
+        distances = symmetric_point_to_plane(pair, self.rounding(pair), self.align_signs)
+        if self.clip is not None:
+            distances = torch.minimum(distances, _clipping_distance(distances.detach(), pair.pair_mask(), self.clip))
+        return weighted_mean(distances, self.buddies(pair, distances, temperature))
+
+
+class BuddyFilter(Loss):
+    """F, Eq. 8 with its sign and norm mended: the mean of Eq. 7 over hard best buddies, found by Eq. 2 at each call.
+
+    Normals of a pair are turned to one side first. The temperature is the length below which the absolute value is
+    rounded off, ``sqrt(r^2 + temperature^2)``; at 0 it is the paper's, whose own curvature is 0 almost everywhere.
+    No buddies: the loss is 0 and so is its gradient.
+    """
+
+    needs_normals = True
+
+    def objective(self, pair: CloudPair) -> Objective:
+        search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)
+
+        def evaluate(motion: RigidMotion, temperature: Tensor) -> Tensor:
+            return self._matched(pair.moved_by(motion), temperature, *search(motion))
+
+        return evaluate
+
+    def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
+        search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)
+        still = RigidMotion.identity(pair.Q.shape[-1], pair.Q.shape[:1], device=pair.Q.device)
+        return self._matched(pair, temperature, *search(still))
+
+    def extra_repr(self) -> str:
+        return f"smoothing={self.smoothing}" if self.smoothing else ""
+
+    def _matched(self, pair: CloudPair, temperature: Tensor, index: Tensor, mutual: Tensor) -> Tensor:
+        P_normals, Q_normals = pair.both_normals()
+        normals = matched_plane_normals(_gathered(P_normals, index), Q_normals)
+        residual = ((pair.Q - _gathered(pair.P, index)) * normals).sum(-1)
+        weights = mutual.to(residual.dtype)
+        if pair.P_weights is not None:
+            weights = weights * pair.P_weights.gather(1, index)
+        if pair.Q_weights is not None:
+            weights = weights * pair.Q_weights
+        distances = smooth_root(residual.square(), temperature.to(residual.dtype)[:, None])
+        return weighted_mean(distances[:, None], weights[:, None])
+
+
+def _gathered(values: Tensor, index: Tensor) -> Tensor:
+    return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+
+def _clipping_distance(distances: Tensor, mask: Tensor | None, deviations: float) -> Tensor:
+    """Root of (mean + deviations x standard deviation) of the squared distances, ``(batch, 1, 1)``."""
+    squared = distances.square() if mask is None else torch.where(mask, distances.square(), torch.nan)
+    mean = squared.nanmean((-1, -2), keepdim=True)
+    spread = (squared - mean).square().nanmean((-1, -2), keepdim=True).sqrt()
+    return (mean + deviations * spread).sqrt().nan_to_num(0.0)
