@@ -1,0 +1,104 @@
+"""What the command line shows: progress while it works, and where everything is when it is done."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from train.evaluate import evaluate_trajectory
+from train.keep_best import SCORE
+from train.mapping import Mapped
+from train.scans import Progress as Report
+
+# The exit code that command lines give to wrong arguments.
+BAD_INPUT = 2
+# What a person looks for in the folder of a map, in this order; files that a run did not write are left out.
+SHOWN = {
+    "trajectory": ("poses_tum.txt", "poses_kitti.txt", "poses.npz"),
+    "map": ("map.ply", "map.html", "occupancy.yaml"),
+    "pictures": ("trajectory.png", "map.png", "occupancy.png", "occupancy_network.png", "losses.png"),
+    "report": ("metrics.json", "config.yaml"),
+}
+
+
+@dataclass(frozen=True)
+class PrintedUnit:
+    """Lengths are printed as ``scale`` times the data's, followed by ``name``."""
+
+    scale: float = 1.0
+    name: str = ""
+
+    @property
+    def of_files(self) -> str:
+        """The unit of the data itself, for the labels of pictures: unknown where printing rescales."""
+        return self.name if self.name and self.scale == 1 else "units"
+
+    def length(self, value: float) -> str:
+        """Four digits and the name of the unit."""
+        return f"{value * self.scale:.4g} {self.name}".rstrip()
+
+
+@contextmanager
+def one_sentence() -> Iterator[None]:
+    """What is wrong with the input in one sentence on stderr and exit code 2, without a traceback."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        typer.echo(f"Error: {error}", err=True)
+        raise typer.Exit(BAD_INPUT) from error
+
+
+@contextmanager
+def shown_progress(console: Console) -> Iterator[Report]:
+    """A bar for each stage of the work; yields what is to be told."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def show_map(console: Console, out: Path, mapped: Mapped, unit: PrintedUnit) -> None:
+    """Which epoch was kept, the errors where there is a truth, and the files."""
+    curve = mapped.result.losses.get(SCORE, [])
+    if curve:
+        console.print(_kept_sentence(mapped.kept_epoch, curve))
+    truth = mapped.result.scans.truth
+    if truth is not None:
+        before = evaluate_trajectory(mapped.start.matrix.numpy(), truth)
+        show_metrics(console, evaluate_trajectory(mapped.result.world_from_scan, truth), unit, before)
+    for title, names in SHOWN.items():
+        found = [str(out / name) for name in names if (out / name).exists()]
+        if found:
+            console.print(f"{title:<11}{found[0]}", *found[1:], sep="\n           ", soft_wrap=True, highlight=False)
+
+
+def show_metrics(
+    console: Console, metrics: Mapping[str, float], unit: PrintedUnit, before: Mapping[str, float] | None = None
+) -> None:
+    """A line for each number; ``before``: the same of the map before the training."""
+    for name in metrics:
+        shown, earlier = (_printed(name, m.get(name), unit) for m in (metrics, before or {}))
+        console.print(f"{name:<26}{shown}" + (f"   (edges' map {earlier})" if earlier else ""), highlight=False)
+
+
+def _printed(name: str, value: float | None, unit: PrintedUnit) -> str:
+    if value is None:
+        return ""
+    return f"{value:.4g} deg" if name.endswith("_deg") else unit.length(value)
+
+
+def _kept_sentence(kept_epoch: int, curve: list[float]) -> str:
+    epochs = len(curve) - 1
+    if kept_epoch == 0:
+        return f"Kept the edges' map: no epoch of {epochs} aligns the held-out points better ({curve[0]:.4f})."
+    return f"Kept epoch {kept_epoch} of {epochs}: alignment {curve[kept_epoch]:.4f}, the edges' map {curve[0]:.4f}."

@@ -1,0 +1,49 @@
+"""Scans made ready for registration: normals from the full scan, then thinned to one size."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bbr_layer import estimate_normals
+from train.scans import ScanSet
+
+# Normals are fitted to this many neighbours of the full scan before it is thinned: a line in 2D, the paper's 13 in 3D.
+NORMAL_NEIGHBOURS = {2: 6, 3: 13}
+
+
+class Prepared(NamedTuple):
+    """Scans thinned to one size, padded: ``(k, n, d)`` points and normals float32, ``(k, n)`` mask."""
+
+    points: Tensor
+    normals: Tensor
+    mask: Tensor
+
+
+def prepare(scans: ScanSet, most: int) -> Prepared:
+    """Normals from the full scans, then at most ``most`` points of each, spread evenly over its order."""
+    neighbours = NORMAL_NEIGHBOURS[scans.dimension]
+    chosen, normals = [], []
+    for scan in scans.points:
+        points = torch.from_numpy(scan)
+        kept = torch.from_numpy(_thinned(scan, most))
+        chosen.append(points[kept])
+        normals.append(estimate_normals(points, neighbours)[kept])
+    sizes = torch.tensor([len(points) for points in chosen])
+    points, directions = (torch.nn.utils.rnn.pad_sequence(x, batch_first=True).float() for x in (chosen, normals))
+    return Prepared(points, directions, torch.arange(int(sizes.max())) < sizes[:, None])
+
+
+def _thinned(scan: np.ndarray, most: int) -> np.ndarray:
+    """Numbers of at most ``most`` points, one per cell of the finest grid that leaves so few: even in space."""
+    if len(scan) <= most:
+        return np.arange(len(scan))
+    low, high = 0.0, float(np.ptp(scan, axis=0).max())
+    kept = np.arange(len(scan))
+    for _ in range(20):  # bisection: 20 halvings tell the cell size to a millionth of the extent
+        cell = (low + high) / 2
+        _, first = np.unique(np.floor(scan / cell).astype(np.int64), axis=0, return_index=True)
+        low, high = (cell, high) if len(first) > most else (low, cell)
+        kept = first if len(first) <= most else kept
+    return np.sort(kept)

@@ -1,0 +1,152 @@
+"""The scans of one run with their names, starting poses and truth, and how they are read from files."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bbr_layer import read_cloud, read_poses, read_scans, scan_paths
+
+# Told a stage, how much of it is done, and of how much.
+Progress = Callable[[str, int, int], None]
+# Share of the largest entry by which a planar pose may leave its plane: files hold about 6 digits.
+PLANE_TOLERANCE = 1e-5
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class ScanSet:
+    """k scans, each in its own sensor frame with the sensor at the origin.
+
+    Parameters
+    ----------
+    points: k arrays ``(n_i, d)`` float64 in the data's unit, d = 2 or 3, none of them empty.
+    names: k names, for messages.
+    timestamps: ``(k,)`` seconds, or the number of the scan.
+    start: ``world_from_scan`` given by the user, ``(k, d + 1, d + 1)``; None: not known.
+    truth: the true ``world_from_scan``, for the report only; None: not known.
+
+    Raises
+    ------
+    ValueError: fewer than 2 scans, mixed dimensions, an empty scan, NaN, or numbers that do not fit together.
+    """
+
+    points: list[Float[np.ndarray, "_ d"]]
+    names: list[str]
+    timestamps: Float[np.ndarray, " k"]
+    start: Float[np.ndarray, "k d1 d1"] | None = None
+    truth: Float[np.ndarray, "k d1 d1"] | None = None
+
+    def __post_init__(self) -> None:
+        k = len(self.points)
+        if k < 2:
+            raise ValueError(f"{k} scan was given; a map needs at least 2: name more files or lower the stride")
+        if len(self.names) != k or self.timestamps.shape != (k,):
+            raise ValueError(f"{k} scans came with {len(self.names)} names and {len(self.timestamps)} timestamps")
+        for name, scan in zip(self.names, self.points, strict=True):
+            if scan.ndim != 2 or scan.shape[1] != self.dimension or scan.shape[1] not in (2, 3):
+                raise ValueError(f"scan {name} has shape {scan.shape}; all scans must be (n, 2), or all (n, 3)")
+            if not len(scan) or not np.isfinite(scan).all():
+                raise ValueError(f"scan {name} is empty or not finite; leave it out")
+        side = self.dimension + 1
+        for role, poses in (("start", self.start), ("truth", self.truth)):
+            if poses is not None and poses.shape != (k, side, side):
+                raise ValueError(f"{role} has shape {poses.shape}; {k} scans need {(k, side, side)}")
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return int(self.points[0].shape[1])
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def fingerprint(self) -> str:
+        """The same for the same points and starting poses, whatever their files are called."""
+        digest = hashlib.sha256(str([scan.shape for scan in self.points]).encode())
+        for array in (*self.points, *(() if self.start is None else (self.start,))):
+            digest.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
+        return digest.hexdigest()
+
+
+def read_scan_set(
+    sources: Sequence[Path],
+    *,
+    start: Path | None = None,
+    truth: Path | None = None,
+    stride: int = 1,
+    progress: Progress = silent,
+) -> ScanSet:
+    """Read a folder of scans, several files, or one .npz of several scans.
+
+    Scans are planar (d = 2) when every z of every scan is 0 or missing.
+
+    Parameters
+    ----------
+    sources: one folder, one ``.npz`` with ``points`` and ``offsets``, or the scan files in their order.
+    start, truth: files of poses, one for each scan before or after the stride.
+    stride: keep every how many-th scan.
+    progress: told each scan.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError: as ``scan_paths``, ``read_cloud`` and ``read_poses``; poses of another number.
+    """
+    if not sources or stride < 1:
+        raise ValueError(f"{len(sources)} sources and stride {stride} were given; both must be at least 1")
+    scans, names, total = _read_points(sources, stride, progress)
+    if all(scan.shape[1] == 2 or not scan[:, 2].any() for scan in scans):
+        scans = [np.ascontiguousarray(scan[:, :2]) for scan in scans]
+    flat = scans[0].shape[1] == 2
+    poses = {
+        role: None if path is None else _read_trajectory(role, path, (total, stride), flat)
+        for role, path in (("start", start), ("truth", truth))
+    }
+    timestamps = np.arange(total, dtype=np.float64)[::stride]
+    return ScanSet(scans, names, timestamps, start=poses["start"], truth=poses["truth"])
+
+
+def _read_points(sources: Sequence[Path], stride: int, progress: Progress) -> tuple[list[np.ndarray], list[str], int]:
+    """Points and names of the kept scans, and how many scans there were."""
+    if len(sources) == 1 and sources[0].suffix.lower() == ".npz":
+        clouds = read_scans(sources[0])
+        names = [f"{sources[0].name}[{number}]" for number in range(len(clouds))]
+        return [cloud.points for cloud in clouds[::stride]], names[::stride], len(clouds)
+    paths = scan_paths(sources[0]) if len(sources) == 1 and not sources[0].is_file() else list(sources)
+    kept = paths[::stride]
+    scans = []
+    for number, path in enumerate(kept):
+        scans.append(read_cloud(path).points)
+        progress("reading", number + 1, len(kept))
+    return scans, [path.name for path in kept], len(paths)
+
+
+def _read_trajectory(role: str, path: Path, scans: tuple[int, int], flat: bool) -> np.ndarray:
+    """Poses of the kept scans, ``(k, d + 1, d + 1)``; ``scans``: how many there were, and the stride."""
+    total, stride = scans
+    kept = -(-total // stride)
+    poses = read_poses(path)
+    if len(poses) not in (total, kept):
+        wanted = f"{total}" if total == kept else f"{total} or, after the stride, {kept}"
+        raise ValueError(f"{role}: {path} holds {len(poses)} poses; the scans need {wanted}")
+    poses = poses[::stride] if len(poses) == total else poses
+    return planar_poses(poses, f"{role}: {path}") if flat else poses
+
+
+def planar_poses(poses: Float[np.ndarray, "k 4 4"], name: str) -> Float[np.ndarray, "k 3 3"]:
+    """Poses in the plane z = 0 as ``(k, 3, 3)``.
+
+    Raises
+    ------
+    ValueError: a pose that leaves the plane.
+    """
+    off_plane = np.concatenate((poses[:, 2, :2], poses[:, :2, 2], poses[:, 2, 3:]), axis=1)
+    if np.abs(off_plane).max() > PLANE_TOLERANCE * np.abs(poses).max():
+        raise ValueError(f"{name} leaves the plane z = 0, but the scans are planar: give poses about z")
+    return poses[:, [0, 1, 3]][:, :, [0, 1, 3]]

@@ -1,0 +1,105 @@
+"""Training the map with Lightning: from scans, edges and starting poses to corrected poses and an occupancy network."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import lightning as L
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+
+from bbr_layer import RigidMotion
+from train.alignment import Alignment
+from train.config import MapConfig
+from train.data_module import MappingData
+from train.keep_best import KeepBest, ReportProgress
+from train.mapping_module import MappingModule, build_module
+from train.pose_graph import Edges
+from train.scans import Progress, ScanSet, silent
+
+# The file in the folder of checkpoints that a killed run goes on from.
+LAST = "last.ckpt"
+LEAF_SPEC = r"`isinstance\(treespec, LeafSpec\)` is deprecated"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What the training found.
+
+    Parameters
+    ----------
+    world_from_scan: ``(k, ...)`` of the epoch that was kept.
+    module: its M-Net knows the map of these poses.
+    curves: per epoch: "total", "occupancy", "registration"; and "alignment", which begins with the starting map.
+    kept_epoch: 0 is the starting map.
+    """
+
+    world_from_scan: RigidMotion
+    module: MappingModule
+    curves: dict[str, list[float]]
+    kept_epoch: int
+
+
+def train_map(
+    scans: ScanSet,
+    edges: Edges,
+    start: RigidMotion,
+    config: MapConfig,
+    *,
+    folder: Path | None = None,
+    progress: Progress = silent,
+    fast_dev_run: bool = False,
+) -> Trained:
+    """Correct the poses so that one occupancy map explains all scans, and never end worse than the start.
+
+    Parameters
+    ----------
+    scans, edges: what is to be aligned.
+    start: ``world_from_scan (k, ...)``; the first stays.
+    config: settings.
+    folder: gets ``checkpoints/`` and ``logs/``; a checkpoint found there is gone on from. None: nothing is written.
+    progress: told each epoch.
+    fast_dev_run: one step only, as Lightning has it.
+    """
+    data = MappingData(scans, edges, start, config=config.training, seed=config.seed)
+    module = build_module(data, config.training, seed=config.seed)
+    best = KeepBest(Alignment(data.prepared, edges), data)
+    if config.training.epochs:
+        trainer = L.Trainer(
+            accelerator=config.device,
+            devices=1,
+            max_epochs=config.training.epochs,
+            callbacks=_callbacks(best, folder, progress),
+            logger=_loggers(folder),
+            reload_dataloaders_every_n_epochs=1,
+            log_every_n_steps=1,
+            fast_dev_run=fast_dev_run,
+            enable_checkpointing=folder is not None,
+            # Progress is reported through ``progress``, for the whole of the run in one place.
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        checkpoint = folder / "checkpoints" / LAST if folder is not None else None
+        found = checkpoint is not None and checkpoint.is_file()
+        with warnings.catch_warnings():
+            # Lightning 2.6 walks trees by a class that torch 2.13 renames; nothing for a user to act on.
+            warnings.filterwarnings("ignore", message=LEAF_SPEC, category=FutureWarning)
+            trainer.fit(module, data, ckpt_path=checkpoint if found else None)
+        best.restore(module)
+    return Trained(module.poses(data.every_scan()), module, best.curves, best.kept_epoch)
+
+
+def _callbacks(best: KeepBest, folder: Path | None, progress: Progress) -> list[L.Callback]:
+    callbacks: list[L.Callback] = [best, ReportProgress(progress)]
+    if folder is not None:
+        # One file, replaced after every epoch; the best poses lie in it, in KeepBest's part.
+        last = ModelCheckpoint(folder / "checkpoints", save_last=True, save_top_k=0, enable_version_counter=False)
+        callbacks.append(last)
+    return callbacks
+
+
+def _loggers(folder: Path | None) -> list[Logger]:
+    if folder is None:
+        return []
+    logs = str(folder / "logs")
+    return [CSVLogger(logs, name="csv"), TensorBoardLogger(logs, name="tensorboard")]
