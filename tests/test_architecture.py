@@ -1,0 +1,170 @@
+"""The drawing of the house, held as data: who may import whom; and that files and functions stay small."""
+
+import ast
+from pathlib import Path
+
+import pytest
+from architecture import Drawing, import_faults, levels, size_faults, sources
+
+PROJECT = Path(__file__).resolve().parent.parent
+
+# One row per level. A module imports only from rows above its own; those of one row do not import each other.
+# "__init__" is the package's public face. A new file needs its name in a row.
+ORDER = {
+    "bbr_layer": """
+        checks
+        rotations
+        geometry
+        pair
+        neighbours distances
+        normals buddies temperature
+        loss_base
+        losses
+        registration start door
+        inner
+        inner.schedules inner.charts
+        inner.adam
+        inner.unroll
+        backward
+        stage
+        layer
+        atomic cloud_columns
+        cloud_tables cloud_formats cloud_writing trajectories
+        clouds
+        functional verdict
+        two_clouds
+        answer
+        __init__
+        __main__
+    """,
+    "models": """
+        localisation occupancy free_space scan_batch
+        edge_clouds
+        buddy_term chamfer_terms residual_term
+        registration_terms deep_mapping
+        __init__
+    """,
+    "train": """
+        __init__
+        world_settings doors
+        floor_plans
+        routes worlds
+        movers
+        simulate
+        simulation_files
+        map_entropy occupancy_grid poses
+        evaluate drawing ros_map
+        curves pictures browser_map
+        config scans
+        prepared pose_graph
+        edges edge_files report run_folder
+        known_edges outputs
+        groups schedule
+        data_module
+        alignment mapping_module
+        keep_best
+        training
+        mapping
+        console
+        __main__
+    """,
+}
+# The packages that each package may import, and then only their public names.
+BELOW = {"bbr_layer": set(), "models": {"bbr_layer"}, "train": {"bbr_layer", "models"}}
+# Top-level names that a package must not import. Lightning is imported by its own name everywhere.
+FORBIDDEN = {
+    "bbr_layer": {"lightning", "pytorch_lightning"},
+    "models": {"lightning", "pytorch_lightning"},
+    "train": {"pytorch_lightning"},
+}
+DRAWING = Drawing(ORDER, BELOW, FORBIDDEN)
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_the_list_names_the_files_that_exist(package):
+    found, listed = set(sources(PROJECT, package)), set(levels(ORDER[package]))
+    assert found - listed == set(), "files without a place in ORDER"
+    assert listed - found == set(), "names in ORDER without a file"
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_no_name_is_listed_twice(package):
+    assert len(ORDER[package].split()) == len(levels(ORDER[package]))
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_imports_point_down(package):
+    assert import_faults(PROJECT, package, DRAWING) == []
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_files_and_functions_stay_small(package):
+    assert size_faults(PROJECT, package) == []
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_every_module_says_what_it_is(package):
+    files = sources(PROJECT, package)
+    mute = [name for name, text in files.items() if not ast.get_docstring(ast.parse(text))]
+    assert mute == [], "modules without a docstring"
+
+
+def test_the_public_face_holds_names_and_nothing_else():
+    body = ast.parse(sources(PROJECT, "bbr_layer")["__init__"]).body[1:]
+    others = [ast.unparse(node) for node in body if not isinstance(node, ast.Import | ast.ImportFrom)]
+    assert [line.split(" = ")[0] for line in others if not line.startswith("__all__")] == ["__version__"]
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Path:
+    """A small project in which everything is allowed."""
+    for package in ORDER:
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").write_text("import torch\n")
+    (tmp_path / "bbr_layer" / "geometry.py").write_text("import bbr_layer.checks\n")
+    (tmp_path / "bbr_layer" / "buddies.py").write_text("from bbr_layer import geometry\n")
+    (tmp_path / "train" / "evaluate.py").write_text("import lightning\nfrom models import DeepMapping\n")
+    for package in ORDER:
+        assert import_faults(tmp_path, package, DRAWING) + size_faults(tmp_path, package) == []
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "words"),
+    [
+        (
+            "bbr_layer/geometry.py",
+            "from bbr_layer.buddies import hard_buddies",
+            "does not stand below buddies",
+        ),
+        ("bbr_layer/normals.py", "from bbr_layer import buddies", "does not stand below buddies"),
+        ("bbr_layer/layer.py", "from bbr_layer import RigidMotion", "does not stand below __init__"),
+        ("bbr_layer/layer.py", "def f():\n    import lightning.pytorch", "must not import lightning"),
+        ("bbr_layer/layer.py", "from .geometry import RigidMotion", "a relative import"),
+        ("bbr_layer/layer.py", "import models", "bbr_layer must not import models"),
+        ("bbr_layer/unheard_of.py", "import bbr_layer.geometry", "does not stand below geometry"),
+        ("models/occupancy.py", "import train", "models must not import train"),
+        (
+            "models/occupancy.py",
+            "from bbr_layer.geometry import RigidMotion",
+            "bbr_layer.geometry is not public",
+        ),
+        ("models/occupancy.py", "from bbr_layer import geometry", "bbr_layer.geometry is not public"),
+        ("train/evaluate.py", "import pytorch_lightning", "must not import pytorch_lightning"),
+        ("train/evaluate.py", "x = 1\n" * 201, "201 lines, at most 200"),
+        ("train/evaluate.py", "def f():\n" + "    x = 1\n" * 40, "41 lines, at most 40"),
+        ("train/evaluate.py", "def f(self, a, b, c, d, e, g): ...", "6 positional arguments, at most 5"),
+    ],
+)
+def test_a_fault_is_found(house, path, text, words):
+    (house / path).write_text(text)
+    package = path.partition("/")[0]
+    faults = import_faults(house, package, DRAWING) + size_faults(house, package)
+    assert len(faults) == 1 and words in faults[0]
+
+
+def test_an_empty_package_is_a_fault(house):
+    for path in (house / "models").iterdir():
+        path.unlink()
+    with pytest.raises(AssertionError, match="models/ is missing or holds no Python file"):
+        import_faults(house, "bbr_layer", DRAWING)

@@ -1,0 +1,115 @@
+"""Registered edges and the pose graph: known motions found, wrong edges survived, the first pose kept."""
+
+import numpy as np
+import pytest
+import torch
+
+from bbr_layer import RigidMotion, angular_error
+from train.config import EdgeConfig
+from train.edges import register_edges
+from train.pose_graph import Edges, chained, solve_pose_graph
+from train.prepared import prepare
+from train.scans import ScanSet
+
+
+def _circle(scans: int, d: int) -> RigidMotion:
+    """Poses on a circle of radius 5, turning with it."""
+    angles = torch.linspace(0, 2 * torch.pi * (1 - 1 / scans), scans, dtype=torch.float64)
+    turn = angles[:, None] if d == 2 else angles[:, None] * torch.tensor([0.0, 0.1, 1.0], dtype=torch.float64)
+    places = torch.stack((5 * torch.sin(angles), 5 - 5 * torch.cos(angles)), 1)
+    places = places if d == 2 else torch.cat((places, 0.1 * angles[:, None]), 1)
+    world = RigidMotion.from_rotvec(turn, places)
+    return world.item(0).inverse() @ world
+
+
+def _edges(world: RigidMotion, pairs: list[tuple[int, int]], noise: float = 0.0) -> Edges:
+    target, source = torch.tensor(pairs).unbind(1)
+    d = world.dimension
+    k = d * (d + 1) // 2
+    motion = world.item(target).inverse() @ world.item(source)
+    shaken = RigidMotion.from_rotvec(
+        noise * torch.randn(len(pairs), k - d, dtype=torch.float64), noise * torch.randn(len(pairs), d).double()
+    )
+    return Edges(
+        target,
+        source,
+        shaken @ motion,
+        torch.eye(k, dtype=torch.float64).expand(len(pairs), k, k),
+        torch.zeros(len(pairs), d, dtype=torch.float64),
+        torch.ones(len(pairs), dtype=torch.float64),
+        torch.where(source - target == 1, 0, 2),
+    )
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_pose_graph_finds_the_poses_and_drops_wrong_loops(d):
+    world = _circle(20, d)
+    pairs = [(i, i + 1) for i in range(19)] + [(i, i + 2) for i in range(18)] + [(0, 19), (1, 18), (2, 17)]
+    edges = _edges(world, pairs, noise=1e-3)
+    wrong = _edges(world, [(3, 12), (5, 16)])
+    wrong = wrong._replace(
+        target_from_source=RigidMotion(wrong.target_from_source.rotation, wrong.target_from_source.translation + 2.0)
+    )
+    poses, weights = solve_pose_graph(edges.joined(wrong), chained(edges, 20))
+    assert torch.equal(poses.translation[0], torch.zeros(d, dtype=torch.float64))
+    assert (poses.translation - world.translation).norm(dim=-1).max() < 0.02
+    assert angular_error(poses.rotation, world.rotation).max() < 0.01
+    assert weights[-2:].max() < 0.01 < 0.3 < weights[:-2].median()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_exact_edges_are_met_exactly_from_a_poor_start(d):
+    world = _circle(12, d)
+    edges = _edges(world, [(i, j) for i in range(12) for j in (i + 1, i + 2, i + 5) if j < 12])
+    start = _circle(12, d)
+    start = RigidMotion(start.rotation, start.translation * 1.1)
+    poses, _ = solve_pose_graph(edges, start)
+    torch.testing.assert_close(poses.matrix, world.matrix, rtol=0, atol=1e-7)
+
+
+def test_a_broken_chain_is_refused():
+    with pytest.raises(ValueError, match="3 consecutive edges were given; 6 scans need 5"):
+        chained(_edges(_circle(6, 2), [(0, 1), (1, 2), (2, 3)]), 6)
+
+
+def _room(scans: int, rays: int = 180) -> ScanSet:
+    """Scans of an L-shaped room by a sensor that walks and turns, exact ranges."""
+    corners = np.array([[0, 0], [8, 0], [8, 3], [5, 3], [5, 7], [0, 7]], dtype=float)
+    walls = [(a, b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    poses, points = [], []
+    for step in range(scans):
+        place, heading = np.array([1.5 + 0.3 * step, 1.5]), 0.1 * step
+        angles = heading + 0.003 + np.linspace(0, 2 * np.pi, rays, endpoint=False)
+        rays_world = np.stack((np.cos(angles), np.sin(angles)), 1)
+        ranges = np.full(rays, np.inf)
+        for corner, along in walls:
+            det = along[0] * rays_world[:, 1] - along[1] * rays_world[:, 0]
+            gap = corner - place
+            far = (along[0] * gap[1] - along[1] * gap[0]) / det
+            share = (rays_world[:, 0] * gap[1] - rays_world[:, 1] * gap[0]) / det
+            hit = (far > 0) & (share >= 0) & (share <= 1)
+            ranges = np.where(hit & (far < ranges), far, ranges)
+        c, s = np.cos(heading), np.sin(heading)
+        poses.append(np.array([[c, -s, place[0]], [s, c, place[1]], [0, 0, 1]]))
+        points.append((rays_world * ranges[:, None]) @ np.array([[c, -s], [s, c]]))
+    truth = np.linalg.inv(poses[0]) @ np.stack(poses)
+    return ScanSet(points, [str(i) for i in range(scans)], np.arange(scans, dtype=float), None, truth)
+
+
+def test_scans_of_a_room_are_mapped_without_any_starting_pose():
+    scans, reports = _room(8), []
+    edges, poses = register_edges(scans, EdgeConfig(window=2, points=180), lambda *told: reports.append(told))
+    truth = RigidMotion.from_matrix(torch.from_numpy(scans.truth))
+    assert (poses.translation - truth.translation).norm(dim=-1).max() < 0.02
+    assert {0, 1} <= set(edges.kind.tolist())
+    assert reports[0][0] == "consecutive scans" and reports[-1][1] == reports[-1][2]
+
+
+def test_scans_are_thinned_evenly_and_padded():
+    scans = _room(3)
+    shorter = ScanSet([scans.points[0][:40], *scans.points[1:]], scans.names, scans.timestamps)
+    prepared = prepare(shorter, 100)
+    assert prepared.points.shape[:2] == prepared.mask.shape
+    assert prepared.mask.sum(1)[0] == 40 and 60 < prepared.mask.sum(1)[1] <= 100
+    assert torch.equal(prepared.points[0, :40], torch.from_numpy(scans.points[0][:40]).float())
+    torch.testing.assert_close(prepared.normals[prepared.mask].norm(dim=-1), torch.ones(int(prepared.mask.sum())))

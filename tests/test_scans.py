@@ -1,0 +1,124 @@
+"""Scans read from files: planar or not, every other one, with poses; and what does not fit together."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from bbr_layer import write_cloud, write_poses_kitti, write_poses_tum
+from train.scans import ScanSet, planar_poses, read_scan_set
+
+
+def turns(count):
+    """Poses in the plane that move and turn."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for number, pose in enumerate(poses):
+        c, s = np.cos(0.1 * number), np.sin(0.1 * number)
+        pose[:2, :2], pose[:2, 3] = [[c, -s], [s, c]], [number, -number]
+    return poses
+
+
+@pytest.fixture
+def folder(tmp_path, rng):
+    """Twelve planar scans of rising size, named so that plain sorting would mix them up."""
+    for number in range(12):
+        flat = np.column_stack((rng.uniform(1, 2, size=(number + 3, 2)), np.zeros(number + 3)))
+        write_cloud(tmp_path / f"scan{number}.ply", flat)
+    return tmp_path
+
+
+def test_a_folder_is_read_in_natural_order_and_planar(folder):
+    scans = read_scan_set([folder])
+    assert scans.dimension == 2
+    assert [len(points) for points in scans.points] == list(range(3, 15))
+    assert scans.names[10] == "scan10.ply"
+    assert scans.timestamps.tolist() == list(range(12))
+    assert scans.start is None and scans.truth is None
+
+
+def test_one_point_off_the_plane_makes_all_scans_3d(folder):
+    write_cloud(folder / "scan5.ply", np.array([[1.0, 1.0, 0.5], [1.0, 2.0, 0.0]]))
+    assert read_scan_set([folder]).dimension == 3
+
+
+def test_files_are_read_in_the_order_given(folder):
+    scans = read_scan_set([folder / "scan7.ply", folder / "scan2.ply"])
+    assert scans.names == ["scan7.ply", "scan2.ply"]
+    assert len(scans.points[0]) == 10
+
+
+def test_an_npz_of_several_scans(tmp_path, rng):
+    points, offsets = rng.normal(size=(9, 3)), np.array([0, 4, 9])
+    np.savez(tmp_path / "all.npz", points=points, offsets=offsets)
+    scans = read_scan_set([tmp_path / "all.npz"])
+    np.testing.assert_array_equal(scans.points[1], points[4:])
+
+
+@pytest.mark.parametrize("before_stride", [True, False])
+def test_the_stride_takes_poses_along(folder, before_stride):
+    write_poses_tum(folder / "truth.txt", turns(12), np.arange(12.0))
+    write_poses_kitti(folder / "start.txt", turns(12) if before_stride else turns(12)[::5])
+    scans = read_scan_set([folder], truth=folder / "truth.txt", start=folder / "start.txt", stride=5)
+    assert scans.names == ["scan0.ply", "scan5.ply", "scan10.ply"]
+    assert scans.timestamps.tolist() == [0, 5, 10]
+    np.testing.assert_allclose(scans.truth, planar_poses(turns(12)[::5], "truth"), atol=1e-9)
+    np.testing.assert_allclose(scans.start, scans.truth, atol=1e-9)
+
+
+def test_progress_is_told_of_every_scan(folder):
+    told = []
+    read_scan_set([folder], progress=lambda *news: told.append(news))
+    assert told[0] == ("reading", 1, 12) and told[-1] == ("reading", 12, 12)
+
+
+def test_poses_of_another_number_are_refused(folder):
+    write_poses_tum(folder / "truth.txt", turns(11), np.arange(11.0))
+    with pytest.raises(ValueError, match=r"truth: .*truth.txt holds 11 poses; the scans need 12"):
+        read_scan_set([folder], truth=folder / "truth.txt")
+
+
+def test_poses_off_the_plane_of_planar_scans_are_refused(folder):
+    poses = turns(12)
+    poses[3, 2, 3] = 0.1
+    write_poses_tum(folder / "start.txt", poses, np.arange(12.0))
+    with pytest.raises(ValueError, match=r"start: .* leaves the plane z = 0"):
+        read_scan_set([folder], start=folder / "start.txt")
+
+
+def test_a_folder_without_scans_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no scans"):
+        read_scan_set([tmp_path])
+
+
+def test_one_scan_is_no_map(folder):
+    with pytest.raises(ValueError, match="needs at least 2"):
+        read_scan_set([folder], stride=12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"names": ["a"]}, "2 scans came with 1 names"),
+        ({"points": [np.zeros((3, 2)), np.zeros((3, 3))]}, "scan b has shape (3, 3)"),
+        ({"points": [np.ones((3, 2)), np.zeros((0, 2))]}, "scan b is empty"),
+        ({"points": [np.full((3, 2), np.nan), np.ones((3, 2))]}, "scan a is empty or not finite"),
+        ({"truth": np.tile(np.eye(4), (2, 1, 1))}, "truth has shape (2, 4, 4)"),
+        ({"start": np.tile(np.eye(3), (3, 1, 1))}, "start has shape (3, 3, 3)"),
+    ],
+)
+def test_what_does_not_fit_is_named(as_a_user, change, words):
+    fields = {"points": [np.ones((3, 2)), np.ones((4, 2))], "names": ["a", "b"], "timestamps": np.arange(2.0)}
+    with pytest.raises(ValueError, match=re.escape(words)):
+        ScanSet(**(fields | change))
+
+
+def test_the_fingerprint_follows_points_and_starting_poses_alone(folder):
+    scans = read_scan_set([folder])
+    same = dataclasses.replace(
+        scans, names=[f"other {name}" for name in scans.names], truth=planar_poses(turns(12), "")
+    )
+    assert same.fingerprint() == scans.fingerprint()
+    moved = [points + (number == 4) * 1e-9 for number, points in enumerate(scans.points)]
+    assert dataclasses.replace(scans, points=moved).fingerprint() != scans.fingerprint()
+    assert dataclasses.replace(scans, start=planar_poses(turns(12), "")).fingerprint() != scans.fingerprint()

@@ -1,0 +1,179 @@
+"""The training as a whole: never worse than its start, and the same answer however often it was broken off."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from small_worlds import displaced, small_config, small_world, true_edges, true_poses
+
+from train.alignment import Alignment
+from train.data_module import prepare_scan
+from train.keep_best import SCORE
+from train.run_folder import open_run
+from train.training import LAST, train_map
+
+# Settings under which few epochs bring displaced poses of the small world closer.
+HELPFUL = {"term": "residual", "localisation_rate": 0.03}
+
+
+class Killed(Exception):
+    """Stands for the end of the process."""
+
+
+def killed_after(epoch):
+    def progress(stage, done, total):
+        if done == epoch:
+            raise Killed
+
+    return progress
+
+
+def weights(trained):
+    return torch.cat([p.flatten() for p in trained.module.model.parameters()])
+
+
+@pytest.mark.parametrize("epoch", [1, 3, 5])
+def test_a_killed_training_goes_on_to_the_same_bits(tmp_path, epoch):
+    scans = small_world()
+    config = small_config(epochs=5, points=40, warm_up=0.2, settle=0.2, **HELPFUL)
+    problem = (scans, true_edges(scans), displaced(true_poses(scans), 0.1), config)
+    whole = train_map(*problem, folder=tmp_path / "whole")
+    with pytest.raises(Killed):
+        train_map(*problem, folder=tmp_path / "killed", progress=killed_after(epoch))
+    resumed = train_map(*problem, folder=tmp_path / "killed")
+    assert torch.equal(resumed.world_from_scan.matrix, whole.world_from_scan.matrix)
+    assert torch.equal(weights(resumed), weights(whole))
+    assert resumed.curves == whole.curves
+    assert resumed.kept_epoch == whole.kept_epoch > 0
+    assert [len(curve) for curve in whole.curves.values()] == [6, 5, 5, 5]
+
+
+def test_a_finished_training_is_not_done_again(tmp_path):
+    scans = small_world()
+    problem = (scans, true_edges(scans), displaced(true_poses(scans), 0.1), small_config())
+    first = train_map(*problem, folder=tmp_path)
+    told = []
+    again = train_map(*problem, folder=tmp_path, progress=lambda *news: told.append(news))
+    assert told == []
+    assert torch.equal(again.world_from_scan.matrix, first.world_from_scan.matrix)
+    assert again.curves == first.curves
+
+
+def test_without_a_folder_nothing_is_written_and_the_answer_is_the_same(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scans = small_world()
+    problem = (scans, true_edges(scans), displaced(true_poses(scans), 0.1), small_config())
+    without = train_map(*problem)
+    assert list(tmp_path.iterdir()) == []
+    assert torch.equal(weights(without), weights(train_map(*problem, folder=tmp_path)))
+
+
+def test_the_best_epoch_is_kept():
+    scans, edges = small_world(), true_edges(small_world())
+    start = displaced(true_poses(scans), 0.1)
+    trained = train_map(scans, edges, start, small_config(epochs=6, warm_up=0, settle=0, **HELPFUL))
+    score = Alignment([prepare_scan(points, 64) for points in scans.points], edges)
+    assert trained.kept_epoch > 0
+    assert trained.curves[SCORE][0] == pytest.approx(score(start))
+    assert trained.curves[SCORE][trained.kept_epoch] == pytest.approx(score(trained.world_from_scan))
+    assert score(trained.world_from_scan) < score(start)
+
+
+def test_a_training_that_only_harms_ends_at_its_start():
+    scans = small_world()
+    config = small_config(epochs=6, term="chamfer", localisation_rate=1.0, warm_up=0, settle=0.5)
+    start = true_poses(scans)
+    trained = train_map(scans, true_edges(scans), start, config)
+    assert trained.kept_epoch == 0
+    assert max(trained.curves[SCORE]) > 2 * trained.curves[SCORE][0]
+    assert torch.equal(trained.world_from_scan.matrix, start.matrix)
+    assert trained.curves[SCORE][-1] == trained.curves[SCORE][0], "the settling phase moved poses"
+
+
+def test_no_epochs_keep_the_start(tmp_path):
+    scans = small_world()
+    start = displaced(true_poses(scans), 0.1)
+    trained = train_map(scans, true_edges(scans), start, small_config(epochs=0), folder=tmp_path)
+    assert torch.equal(trained.world_from_scan.matrix, start.matrix)
+    assert trained.kept_epoch == 0 and trained.curves == {}
+
+
+def test_fast_dev_run(tmp_path):
+    scans = small_world()
+    trained = train_map(scans, true_edges(scans), true_poses(scans), small_config(), folder=tmp_path, fast_dev_run=True)
+    assert len(trained.curves["total"]) == 1
+
+
+def test_logs_for_people_and_programs(tmp_path):
+    scans = small_world()
+    train_map(scans, true_edges(scans), true_poses(scans), small_config(), folder=tmp_path)
+    lines = (tmp_path / "logs" / "csv" / "version_0" / "metrics.csv").read_text().splitlines()
+    assert {"epoch", SCORE, "loss/total", "loss/occupancy", "loss/registration"} <= set(lines[0].split(","))
+    assert len(lines) == 3
+    assert list((tmp_path / "logs" / "tensorboard" / "version_0").glob("events*"))
+
+
+@pytest.fixture
+def opened(tmp_path):
+    """Opens one folder, with files in it as a finished run leaves them."""
+
+    def opening(scans, config, *, finished=True, **settings):
+        run = open_run(tmp_path, scans, config, **settings)
+        seen = run.registered, run.begun
+        (tmp_path / "edges.npz").write_text("edges")
+        (tmp_path / "checkpoints" / LAST).write_text("training")
+        if finished:
+            (tmp_path / "poses.npz").write_text("a map")
+        return seen
+
+    return opening
+
+
+def test_a_folder_with_another_map_is_refused(tmp_path, opened):
+    opened(small_world(), small_config())
+    assert opened(small_world(), small_config()) == (False, False)
+    with pytest.raises(ValueError, match="holds a map made from other training: give another folder"):
+        opened(small_world(), small_config(term="chamfer"))
+    with pytest.raises(ValueError, match="made from other scans and edges"):
+        opened(small_world(3), small_config(), origin="poses")
+    (tmp_path / "checkpoints" / "run.json").unlink()
+    with pytest.raises(ValueError, match="made from unknown settings"):
+        opened(small_world(), small_config())
+    assert (tmp_path / "edges.npz").exists()
+
+
+def test_an_unfinished_run_of_other_settings_is_replaced(tmp_path, opened):
+    opened(small_world(), small_config(), finished=False)
+    open_run(tmp_path, small_world(), small_config(term="chamfer"))
+    assert not (tmp_path / "edges.npz").exists()
+    assert not (tmp_path / "checkpoints" / LAST).exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "kept"),
+    [
+        ({}, (True, True)),
+        ({"training": {"term": "chamfer"}}, (True, False)),
+        ({"seed": 1}, (True, False)),
+        ({"edges": {"window": 2}}, (False, False)),
+        ({"device": "auto"}, (True, True)),
+    ],
+)
+def test_resume_keeps_what_fits(tmp_path, opened, change, kept):
+    opened(small_world(), small_config())
+    config = small_config().model_copy(update={"seed": change.get("seed", 0), "device": change.get("device", "cpu")})
+    for section in ("edges", "training"):
+        updated = getattr(config, section).model_copy(update=change.get(section, {}))
+        config = config.model_copy(update={section: updated})
+    run = open_run(tmp_path, small_world(), config, resume=True)
+    assert (run.registered, run.begun) == kept
+    assert (tmp_path / "edges.npz").exists() == kept[0]
+    assert (tmp_path / "checkpoints" / LAST).exists() == kept[1]
+
+
+def test_resume_looks_at_the_points(opened):
+    opened(small_world(), small_config())
+    scans = small_world()
+    moved = dataclasses.replace(scans, points=[points + np.float64(1e-6) for points in scans.points])
+    assert opened(moved, small_config(), resume=True) == (False, False)
