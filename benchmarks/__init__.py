@@ -1,0 +1,1 @@
+"""Measurements as tables, never part of the tests."""
