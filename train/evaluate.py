@@ -69,8 +69,9 @@ def align_trajectories(
     """The rigid motion ``truth_from_estimate`` ``(4, 4)``, without scale, that brings the positions closest.
 
     Umeyama's least squares as ``evo`` does it, with two additions. Planar trajectories (z = 0) are aligned within
-    their plane: turning the plane over, which ``evo`` would consider for a mirror image, is no motion of theirs. Where the positions leave a rotation open (one pose, a standing sensor, a straight line in 3D,
-    all refused by ``evo``), the orientations decide it.
+    their plane: turning the plane over, which ``evo`` would consider for a mirror image, is no motion of theirs.
+    Where the positions leave a rotation open (one pose, a standing sensor, a straight line in 3D, all refused by
+    ``evo``), the orientations decide it.
     """
     estimate, truth = checked_poses(estimate, "estimate"), checked_poses(truth, "truth")
     check_same_number(estimate, truth)
