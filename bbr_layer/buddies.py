@@ -59,13 +59,14 @@ def soft_buddies(
     logits = -distances / temperature.to(distances.dtype)[..., None, None]
     if mask is not None:
         logits = torch.where(mask, logits, MASKED_LOGIT)
-    rows = _log_normaliser(logits, -1, outlier)
-    columns = _log_normaliser(logits, -2, outlier)
+    rows = log_normaliser(logits, -1, outlier)
+    columns = log_normaliser(logits, -2, outlier)
     buddies = torch.exp(2 * logits - rows - columns)
     return buddies if mask is None else torch.where(mask, buddies, 0.0)
 
 
-def _log_normaliser(logits: Tensor, dim: int, outlier: float) -> Tensor:
+def log_normaliser(logits: Tensor, dim: int, outlier: float) -> Tensor:
+    """Logarithm of a denominator of Eq. 4, ``log(outlier + sum exp(logits))`` over ``dim``, which is kept."""
     total = torch.logsumexp(logits, dim, keepdim=True)
     if outlier == 0:
         return total

@@ -54,7 +54,7 @@ def symmetric_point_to_plane(
     """
     normals = pair.both_normals()
     residual = torch.zeros((), dtype=pair.P.dtype, device=pair.P.device)
-    sign = _signs(*normals) if align_signs else 1.0
+    sign = normal_signs(*normals) if align_signs else 1.0
     columns = (x.unbind(-1) for x in (pair.P, pair.Q, *normals))
     for p, q, p_normal, q_normal in zip(*columns, strict=True):
         offset = q[:, None, :] - p[:, :, None]
@@ -62,7 +62,7 @@ def symmetric_point_to_plane(
     return smooth_root(residual.square(), smoothing)
 
 
-def _signs(P_normals: Tensor, Q_normals: Tensor) -> Tensor:
+def normal_signs(P_normals: Tensor, Q_normals: Tensor) -> Tensor:
     """Sign of ``<n_p, n_q>`` for every pair, +1 where they are orthogonal; piecewise constant, so no gradient."""
     inner = P_normals.detach() @ Q_normals.detach().mT
     return torch.where(inner < 0, -1.0, 1.0).to(inner.dtype)

@@ -68,6 +68,18 @@ class CloudPair(NamedTuple):
             raise ValueError(f"{missing} is missing; point-to-plane distances need both: try estimate_normals")
         return self.P_normals, self.Q_normals
 
+    def both_features(self) -> tuple[Tensor, Tensor]:
+        """The features of P and of Q.
+
+        Raises
+        ------
+        ValueError: one of them is missing.
+        """
+        if self.P_features is None or self.Q_features is None:
+            missing = "P_features" if self.P_features is None else "Q_features"
+            raise ValueError(f"{missing} is missing; matching by features needs both: or match='points'")
+        return self.P_features, self.Q_features
+
     def pair_mask(self) -> Tensor | None:
         """True where both points are real, broadcast to ``(batch, n, m)``; None when every point is."""
         if self.P_mask is None and self.Q_mask is None:

@@ -18,12 +18,17 @@ ORDER = {
         pair
         neighbours distances
         normals buddies temperature
+        kernels
+        kernels.scene
+        kernels.blocks kernels.forward_mode
+        kernels.reference kernels.matched
+        kernels.soft
         loss_base
         losses
         registration start door
         inner
         inner.schedules inner.charts
-        inner.adam
+        inner.adam inner.pose_gradient
         inner.unroll
         backward
         stage
