@@ -3,6 +3,7 @@
 from bbr_layer.atomic import atomic_write as atomic_write
 from bbr_layer.backward import Autograd as Autograd
 from bbr_layer.backward import Detached as Detached
+from bbr_layer.backward import Replay as Replay
 from bbr_layer.backward import Truncated as Truncated
 from bbr_layer.buddies import hard_buddies as hard_buddies
 from bbr_layer.buddies import soft_buddies as soft_buddies
@@ -22,6 +23,8 @@ from bbr_layer.inner.charts import RotationVector as RotationVector
 from bbr_layer.inner.schedules import Constant as Constant
 from bbr_layer.inner.schedules import Cosine as Cosine
 from bbr_layer.inner.schedules import StepDown as StepDown
+from bbr_layer.kernels.choice import Backend as Backend
+from bbr_layer.kernels.choice import backend as backend
 from bbr_layer.layer import BBRLayer as BBRLayer
 from bbr_layer.losses import BuddyFilter as BuddyFilter
 from bbr_layer.losses import SoftBBS as SoftBBS

@@ -1,9 +1,41 @@
 """How gradients reach the inputs through the inner registration: one small object each.
 
-A mode answers, for each inner step of the whole layer, whether it is kept differentiable.
+A mode answers, for each inner step of the whole layer, whether it is kept differentiable, and whether the loss is
+differentiated as written or by its closed form.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Assumes nothing: the exact gradient of all steps, from the clouds and a few numbers per step.
+
+    The loss's gradient is a closed form; going backwards, each step asks for the derivative of that form along one
+    direction (forward over reverse; Griewank and Walther, Evaluating Derivatives, 2008). Memory does not grow with
+    steps x n x m. First derivatives only: ``Autograd`` has second ones.
+
+    Parameters
+    ----------
+    last_steps: how many steps to go back, counted over all stages from the end; None: all. With a number it is
+        ``Truncated``.
+
+    Raises
+    ------
+    ValueError: fewer than one step.
+    """
+
+    closed_form: ClassVar[bool] = True
+    last_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.last_steps is not None:
+            _check_last_steps(self.last_steps)
+
+    def attached(self, step: int, steps: int) -> bool:
+        """True at every step, or at the last ``last_steps``."""
+        return self.last_steps is None or step >= steps - self.last_steps
 
 
 @dataclass(frozen=True)
@@ -12,6 +44,8 @@ class Autograd:
 
     Memory grows with steps x n x m for the soft losses. It is the oracle that every other mode is tested against.
     """
+
+    closed_form: ClassVar[bool] = False
 
     def attached(self, step: int, steps: int) -> bool:
         """True at every step."""
@@ -35,11 +69,11 @@ class Truncated:
     ValueError: fewer than one step.
     """
 
+    closed_form: ClassVar[bool] = True
     last_steps: int = 20
 
     def __post_init__(self) -> None:
-        if self.last_steps < 1:
-            raise ValueError(f"last_steps is {self.last_steps}; keep at least 1, or use Detached() to keep none")
+        _check_last_steps(self.last_steps)
 
     def attached(self, step: int, steps: int) -> bool:
         """True for the last ``last_steps`` of ``steps``."""
@@ -53,9 +87,16 @@ class Detached:
     The motion still differentiates in the points it is applied to.
     """
 
+    closed_form: ClassVar[bool] = True
+
     def attached(self, step: int, steps: int) -> bool:
         """False at every step."""
         return False
 
 
-Backward = Autograd | Truncated | Detached
+Backward = Replay | Truncated | Autograd | Detached
+
+
+def _check_last_steps(last_steps: int) -> None:
+    if last_steps < 1:
+        raise ValueError(f"last_steps is {last_steps}; keep at least 1, or use Detached() to keep none")

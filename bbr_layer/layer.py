@@ -2,11 +2,12 @@
 
 import logging
 from contextlib import nullcontext
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from bbr_layer.backward import Autograd, Backward, Detached
+from bbr_layer.backward import Backward, Detached, Replay
 from bbr_layer.door import batch_shape, checked_pair, checked_start
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam
@@ -27,7 +28,8 @@ class BBRLayer(nn.Module):
     ----------
     stages: ``Stage`` objects, each starting where the last one ended; or one of the paper's names ``"softBBS"``,
         ``"softBD"``, ``"N"``, ``"F"`` for a single scale-free stage. None: the measured default, softBBS then F.
-    backward: how gradients reach the inputs: ``Autograd()`` (default), ``Truncated(last_steps)`` or ``Detached()``.
+    backward: how gradients reach the inputs: ``Replay()`` (default), ``Truncated(last_steps)``, ``Autograd()`` or
+        ``Detached()``.
     inner, temperature: settings of the one stage that is given by name.
 
     Raises
@@ -58,7 +60,7 @@ class BBRLayer(nn.Module):
             raise ValueError("stages must all be Stage objects, or one of the paper's names alone: try BBRLayer('F')")
         chosen = [named_stage(names[0], inner, temperature)] if named else given or default_stages()
         self.stages = nn.ModuleList(chosen)
-        self.backward_mode = Autograd() if backward is None else backward
+        self.backward_mode = Replay() if backward is None else backward
         self.scaled = all(stage.chart.scaled for stage in chosen)
 
     @property
@@ -127,7 +129,8 @@ class BBRLayer(nn.Module):
         stages = self.sequence
         steps, done = sum(stage.inner.steps for stage in stages), 0
         for stage in stages:
-            ended = stage(pair, frame, motion, lambda step, before=done: mode.attached(before + step, steps))
+            attached = partial(_attached, mode, done, steps)
+            ended = stage(pair, frame, motion, attached, closed_form=mode.closed_form)
             motion, done = ended.motion, done + stage.inner.steps
         buddies, information = matched_information(pair, frame.enter(motion), frame)
         status = judge(motion, buddies, information, frame, ended.settled)
@@ -173,6 +176,11 @@ class BBRLayer(nn.Module):
     def __repr__(self) -> str:
         stages = ", ".join(map(repr, self.stages))
         return f"BBRLayer({stages}, backward={self.backward_mode!r})"
+
+
+def _attached(mode: Backward, done: int, steps: int, step: int) -> bool:
+    """Whether ``step`` of a stage that begins after ``done`` of all ``steps`` is kept differentiable."""
+    return mode.attached(done + step, steps)
 
 
 def _device_type(points: Tensor) -> str:

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from bbr_layer.buddies import OUTLIER_CONSTANT, soft_buddies
 from bbr_layer.distances import smooth_root, squared_distances
 from bbr_layer.geometry import RigidMotion
+from bbr_layer.kernels.scene import Kernel, SoftTerms
+from bbr_layer.kernels.soft import SoftKernel
 from bbr_layer.normals import point_spacing
 from bbr_layer.pair import CloudPair
 
@@ -42,6 +44,10 @@ class Loss(nn.Module):
         """The loss as a function of the motion and the temperature, with ``pair.Q`` not yet moved."""
         return lambda motion, temperature: self(pair.moved_by(motion), temperature)
 
+    def kernel(self, pair: CloudPair) -> Kernel:
+        """The loss in closed form, for a pair whose source is not yet moved."""
+        raise NotImplementedError
+
     def temperature_unit(self, pair: CloudPair) -> Tensor:
         """Spacing that temperatures are multiples of, ``(batch,)``."""
         return pair.known_spacing().to(pair.P.dtype)
@@ -71,6 +77,17 @@ class SoftLoss(Loss):
             raise ValueError(f"outlier is {outlier}; the epsilon of Eq. 4 must not be negative: try 1e-10")
         self.outlier, self.match, self.feature_weight = outlier, match, feature_weight
         self.matches_features = match in ("features", "both")
+
+    def kernel(self, pair: CloudPair) -> Kernel:
+        """Sweeps over all pairs of points, by the fastest backend there is."""
+        match = self._matching(pair)
+        if match != "points":
+            pair.both_features()
+        return SoftKernel(self.terms(match))
+
+    def terms(self, match: str) -> SoftTerms:
+        """What the kernels need to know; ``match`` is settled."""
+        raise NotImplementedError
 
     def extra_repr(self) -> str:
         features = f", match={self.match!r}, feature_weight={self.feature_weight}"

@@ -10,6 +10,8 @@ from torch import Tensor
 from bbr_layer.buddies import OUTLIER_CONSTANT
 from bbr_layer.distances import matched_plane_normals, point_to_point, smooth_root, symmetric_point_to_plane
 from bbr_layer.geometry import RigidMotion
+from bbr_layer.kernels.matched import MatchedKernel
+from bbr_layer.kernels.scene import Kernel, SoftTerms
 from bbr_layer.loss_base import Loss, Objective, SoftLoss, weighted_mean
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.pair import CloudPair
@@ -44,6 +46,9 @@ class SoftBBS(SoftLoss):
         if match == "features":
             raise ValueError("match='features' leaves softBBS without a pose to find: use match='both', or SoftBD")
 
+    def terms(self, match: str) -> SoftTerms:
+        return SoftTerms(mean=False, outlier=self.outlier, match=match, feature_weight=self.feature_weight)
+
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         distances = point_to_point(pair, self.rounding(pair))
         return -self.buddies(pair, distances, temperature).sum((-1, -2), dtype=torch.float64)
@@ -55,6 +60,9 @@ class SoftBD(SoftLoss):
     Parameters as for ``SoftBBS``; with ``match="features"`` buddies are found by features alone and the loss is
     their distance in space.
     """
+
+    def terms(self, match: str) -> SoftTerms:
+        return SoftTerms(mean=True, outlier=self.outlier, match=match, feature_weight=self.feature_weight)
 
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         distances = point_to_point(pair, self.rounding(pair))
@@ -90,6 +98,9 @@ class SoftBDNormals(SoftLoss):
             ", match='points', feature_weight=1.0", ""
         )
 
+    def terms(self, match: str) -> SoftTerms:
+        return SoftTerms(True, True, self.align_signs, outlier=self.outlier, clip=self.clip)
+
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         distances = symmetric_point_to_plane(pair, self.rounding(pair), self.align_signs)
         if self.clip is not None:
@@ -114,6 +125,10 @@ class BuddyFilter(Loss):
             return self._matched(pair.moved_by(motion), temperature, *search(motion))
 
         return evaluate
+
+    def kernel(self, pair: CloudPair) -> Kernel:
+        pair.both_normals()
+        return MatchedKernel(MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask))
 
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)

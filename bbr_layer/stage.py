@@ -9,9 +9,10 @@ from torch import Tensor, nn
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.charts import Chart, EulerAngles, RotationVector
+from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.schedules import Constant, StepDown
-from bbr_layer.inner.unroll import Problem, run
-from bbr_layer.loss_base import Loss
+from bbr_layer.inner.unroll import Problem, cut_from_graph, run, value
+from bbr_layer.loss_base import Loss, Objective
 from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD, SoftBDNormals
 from bbr_layer.pair import CloudPair, Frame, centre_and_radius
 from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
@@ -58,22 +59,31 @@ class Stage(nn.Module):
         self.chart = RotationVector() if chart is None else chart
 
     def forward(
-        self, pair: CloudPair, frame: Frame, start: RigidMotion, attached: Callable[[int], bool]
+        self, pair: CloudPair, frame: Frame, start: RigidMotion, attached: Callable[[int], bool], closed_form: bool
     ) -> StageResult:
-        """Lower the loss of the centred ``pair`` from ``start``; ``attached(step)`` says which steps keep a graph."""
-        problem = self._problem(pair, frame)
-        cut = self._problem(pair.detach(), Frame(*(x.detach() for x in frame)))
+        """Lower the loss of the centred ``pair`` from ``start``.
+
+        ``attached(step)`` says which steps keep a graph; ``closed_form`` takes gradients from the kernels instead of
+        differentiating the loss.
+        """
+        problem = self._problem(pair, frame, closed_form)
+        cut = cut_from_graph(problem, lambda: self.loss.objective(pair.detach()))
         end, earlier = run(problem, start, attached, cut)
         reached = problem if attached(self.inner.steps - 1) else cut
         motion = self.chart.motion(end.state, reached.frame)
         final = end.temperature if self.temperature.learned else self.temperature.at(1.0, problem.unit)
-        loss = problem.objective(motion, final)
+        loss = value(problem, motion, final)
         settled = _settled(self.chart.motion(earlier, frame), motion, pair)
         return StageResult(reached.frame.leave(motion), loss, final * frame.scale, end.gradient_norm, settled)
 
-    def _problem(self, pair: CloudPair, frame: Frame) -> Problem:
+    def _problem(self, pair: CloudPair, frame: Frame, closed_form: bool) -> Problem:
         unit = self.loss.temperature_unit(pair).double()
-        return Problem(self.loss.objective(pair), self.chart, frame, self.temperature, unit, self.inner)
+        if closed_form:
+            rounding = self.loss.smoothing * pair.known_spacing().double()
+            loss: Objective | PairKernel = PairKernel(self.loss.kernel(pair), pair, rounding)
+        else:
+            loss = self.loss.objective(pair)
+        return Problem(loss, self.chart, frame, self.temperature, unit, self.inner)
 
     def __repr__(self) -> str:
         return f"Stage({self.loss!r}, {self.inner!r}, {self.temperature!r}, {self.chart!r})"

@@ -21,7 +21,13 @@ ORDER = {
         kernels
         kernels.scene
         kernels.blocks kernels.forward_mode
-        kernels.reference kernels.matched
+        kernels.reference kernels.matched kernels.cpu_math
+        kernels.cpu_pairs kernels.cpu_items
+        kernels.cpu_sweeps kernels.cpu_dual kernels.cpu_dual_forces
+        kernels.cpu_dual_planes
+        kernels.cpu_batch
+        kernels.cpu
+        kernels.choice
         kernels.soft
         loss_base
         losses

@@ -5,7 +5,7 @@ import torch
 from problems import motion, noisy_pair
 
 from bbr_layer import BuddyFilter, CloudPair, RigidMotion, SoftBBS, SoftBD, SoftBDNormals
-from bbr_layer.inner.pose_gradient import pose_slope
+from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.kernels import blocks
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.scene import SoftTerms
@@ -66,7 +66,7 @@ def test_closed_form_is_plain_differentiation(name, d, masked, rows, monkeypatch
     pair, at, temperature = _scene(d, masked)
     search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)
     kernel = MatchedKernel(search) if terms is None else SoftKernel(terms)
-    found = pose_slope(kernel, pair, loss.smoothing * pair.spacing, at, temperature)
+    found = PairKernel(kernel, pair, loss.smoothing * pair.spacing).slope(at, temperature)
     value = loss.objective(pair)(at, temperature)
     wanted = (value, *torch.autograd.grad(value.sum(), (*at, temperature), create_graph=True))
     assert all(_relative_error(f, w) < 1e-12 for f, w in zip(found, wanted, strict=True))

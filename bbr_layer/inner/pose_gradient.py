@@ -27,11 +27,27 @@ class PoseSlope(NamedTuple):
     temperature: Tensor
 
 
-def pose_slope(
-    kernel: Kernel, pair: CloudPair, rounding: Tensor, motion: RigidMotion, temperature: Tensor
-) -> PoseSlope:
-    """Loss and slope of the pair with its source carried by ``motion``; once differentiable in all it is given."""
-    return PoseSlope(*_Slope.apply(kernel, rounding, temperature, *motion, *pair))
+class PairKernel(NamedTuple):
+    """A loss in closed form, bound to a pair of clouds whose source is not yet moved.
+
+    Parameters
+    ----------
+    kernel: the closed form.
+    pair: the clouds.
+    rounding: ``(batch,)`` float64, length below which distances are rounded off.
+    """
+
+    kernel: Kernel
+    pair: CloudPair
+    rounding: Tensor
+
+    def slope(self, motion: RigidMotion, temperature: Tensor) -> PoseSlope:
+        """Loss and slope with the source carried by ``motion``; once differentiable in everything."""
+        return PoseSlope(*_Slope.apply(self.kernel, self.rounding, temperature, *motion, *self.pair))
+
+    def detach(self) -> "PairKernel":
+        """The same, cut from the graph."""
+        return PairKernel(self.kernel, self.pair.detach(), self.rounding.detach())
 
 
 class _Slope(torch.autograd.Function):
@@ -96,11 +112,12 @@ def _into_own_frame(
 
 
 def _scaled(scene: Scene, factor: Tensor) -> Scene:
-    def scaled(values: Tensor | None) -> Tensor | None:
-        return None if values is None else values * factor.reshape(-1, *[1] * (values.ndim - 1)).to(values.dtype)
-
-    pair = CloudPair._make(scaled(x) for x in scene.pair)
+    pair = CloudPair._make(_times(field, factor) for field in scene.pair)
     return Scene(pair, scene.temperature * factor, scene.rounding * factor)
+
+
+def _times(values: Tensor | None, factor: Tensor) -> Tensor | None:
+    return None if values is None else values * factor.reshape(-1, *[1] * (values.ndim - 1)).to(values.dtype)
 
 
 def _sum(first: Scene, second: Scene) -> Scene:

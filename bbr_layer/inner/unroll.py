@@ -10,6 +10,7 @@ from torch import Tensor
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam, Moments, adam_direction
 from bbr_layer.inner.charts import Chart, State, tangent_zero
+from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.loss_base import Objective
 from bbr_layer.pair import Frame
 from bbr_layer.rotations import rotation_dimensions
@@ -22,7 +23,7 @@ SETTLED_TAIL = 0.1
 class Problem(NamedTuple):
     """What one stage minimises, and how: everything that stays the same from step to step."""
 
-    objective: Objective
+    loss: Objective | PairKernel  # a function to differentiate, or a closed form
     chart: Chart
     frame: Frame
     temperature: Temperature
@@ -101,9 +102,18 @@ def loss_gradient(problem: Problem, state: State, temperature: Tensor, different
         tangent = tangent_zero(batch, d, temperature.device).requires_grad_()
         warmth = torch.zeros_like(temperature).requires_grad_()
         motion = problem.chart.motion(problem.chart.moved(state, tangent), problem.frame)
-        loss = problem.objective(motion, torch.maximum(temperature + warmth, _floor(problem)))
+        warm = torch.maximum(temperature + warmth, _floor(problem))
         leaves = (tangent, warmth) if problem.temperature.learned else (tangent,)
-        gradients = torch.autograd.grad(loss.sum(), leaves, create_graph=differentiable, materialize_grads=True)
+        cotangents: tuple[Tensor, ...]
+        values: tuple[Tensor, ...]
+        if isinstance(problem.loss, PairKernel):
+            with torch.set_grad_enabled(differentiable):
+                loss, *slopes = problem.loss.slope(motion, warm)
+            values, cotangents = (*motion, warm), tuple(slopes)
+        else:
+            loss = problem.loss(motion, warm)
+            values, cotangents = (loss,), (torch.ones_like(loss),)
+        gradients = torch.autograd.grad(values, leaves, cotangents, create_graph=differentiable, materialize_grads=True)
     columns = [gradients[0]] + [g[:, None] for g in gradients[1:]]
     return loss if differentiable else loss.detach(), torch.cat(columns, dim=-1)
 
@@ -139,6 +149,20 @@ def _fixed(state: State, problem: Problem, detached: Problem) -> State:
     """A pose found without a graph, as one that stays put in the user's frame while the clouds' centres vary."""
     motion = detached.frame.leave(problem.chart.motion(state, detached.frame))
     return problem.chart.begin(motion, problem.frame)
+
+
+def cut_from_graph(problem: Problem, plain: Callable[[], Objective]) -> Problem:
+    """The same problem with every input cut from the graph; ``plain`` makes a function to differentiate anew."""
+    loss = problem.loss.detach() if isinstance(problem.loss, PairKernel) else plain()
+    frame = Frame(*(field.detach() for field in problem.frame))
+    return problem._replace(loss=loss, frame=frame, unit=problem.unit.detach())
+
+
+def value(problem: Problem, motion: RigidMotion, temperature: Tensor) -> Tensor:
+    """The loss alone, ``(batch,)``, differentiable where the problem is."""
+    if isinstance(problem.loss, PairKernel):
+        return problem.loss.slope(motion, temperature).loss
+    return problem.loss(motion, temperature)
 
 
 def _floor(problem: Problem) -> Tensor:

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.kernels.reference import soft_directional, soft_gradient
+from bbr_layer.kernels.choice import sweeps_for
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 
 
@@ -15,8 +15,8 @@ class SoftKernel:
 
     def gradient(self, scene: Scene, motion: RigidMotion) -> tuple[Tensor, Scene]:
         """Loss ``(batch,)`` and gradient by everything in the scene; see ``Kernel``."""
-        return soft_gradient(self.terms, scene)
+        return sweeps_for(self.terms, scene).gradient(self.terms, scene)
 
     def directional(self, scene: Scene, motion: RigidMotion, direction: Direction) -> tuple[Scene, Scene]:
         """The gradient, and its derivative along ``direction``."""
-        return soft_directional(self.terms, scene, direction)
+        return sweeps_for(self.terms, scene).directional(self.terms, scene, direction)

@@ -1,0 +1,121 @@
+"""The compiled sweeps behind the interface of ``reference.py``: tensors in, tensors out, nothing of size n x m."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bbr_layer.kernels.cpu_batch import COLUMN_OUT, DUAL, GRADIENT, ROW_OUT, Packed, Sums, run_sweeps
+from bbr_layer.kernels.cpu_math import (
+    ALIGN,
+    CHANNELS,
+    COLUMN_CHANNELS,
+    CONSTANTS,
+    COOL,
+    COOL_RATE,
+    SMOOTH,
+    VELOCITY,
+    WEIGHT,
+)
+from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
+from bbr_layer.pair import CloudPair
+
+# Where padded points are put, and how long their normals are: so far from everything, along every axis, that nothing
+# of them reaches a sum: their exponential is 1e-38 in float32, and the square of their distance times that, over the
+# epsilon of Eq. 4, stays below 1e-9.
+FAR, LONG_NORMAL = 1e8, 10.0
+# The smallest epsilon of Eq. 4 that sums of float32 exponentials can be added to without subtracting a maximum first.
+SMALLEST_OUTLIER = 1e-12
+
+
+def supports(terms: SoftTerms, scene: Scene) -> bool:
+    """Whether the compiled sweeps can do it: found by distances, with an epsilon, nothing clipped."""
+    return terms.match == "points" and terms.clip is None and terms.outlier >= SMALLEST_OUTLIER
+
+
+def gradient(terms: SoftTerms, scene: Scene) -> tuple[Tensor, Scene]:
+    """As ``reference.soft_gradient``."""
+    sums = run_sweeps(GRADIENT, _packed(terms, scene, None), terms.outlier, terms.mean)
+    return torch.from_numpy(sums.losses), _unpacked(scene, sums, 0)
+
+
+def directional(terms: SoftTerms, scene: Scene, direction: Direction) -> tuple[Scene, Scene]:
+    """As ``reference.soft_directional``."""
+    sums = run_sweeps(DUAL, _packed(terms, scene, direction), terms.outlier, terms.mean)
+    gradient, rates = _unpacked(scene, sums, 0), _unpacked(scene, sums, 1)
+    # The derivative by the temperature has alpha^2 below it, which changes too.
+    cooling = 2 * gradient.temperature * direction.temperature / scene.temperature
+    return gradient, rates._replace(temperature=rates.temperature - cooling)
+
+
+def _packed(terms: SoftTerms, scene: Scene, direction: Direction | None) -> Packed:
+    pair = scene.pair
+    rows = _side(pair.P, pair.P_weights, pair.P_mask, CHANNELS)
+    columns = _side(pair.Q, pair.Q_weights, pair.Q_mask, COLUMN_CHANNELS)
+    if direction is not None:
+        _put(columns, VELOCITY, direction.Q)
+    row_normals, column_normals = None, None
+    if terms.planes:
+        P_normals, Q_normals = pair.both_normals()
+        row_normals, column_normals = _normals(P_normals, pair.P_mask, 3), _normals(Q_normals, pair.Q_mask, 6)
+        if direction is not None and direction.Q_normals is not None:
+            _put(column_normals, 3, direction.Q_normals)
+    constants = np.zeros((len(rows), CONSTANTS), dtype=rows.dtype)
+    constants[:, SMOOTH] = scene.rounding.detach().numpy() ** 2
+    constants[:, COOL] = 1 / scene.temperature.detach().numpy()
+    constants[:, ALIGN] = float(terms.align_signs)
+    if direction is not None:
+        constants[:, COOL_RATE] = (direction.temperature / scene.temperature).detach().numpy()
+    return Packed(rows, columns, row_normals, column_normals, constants)
+
+
+def _side(points: Tensor, weights: Tensor | None, mask: Tensor | None, channels: int) -> np.ndarray:
+    """Channels ``(batch, channels, n)`` of one cloud, the padded points far away and without weight."""
+    batch, n, d = points.shape
+    side = np.zeros((batch, channels, n), dtype=points.detach().numpy().dtype)
+    side[:, :d] = points.detach().numpy().transpose(0, 2, 1)
+    side[:, WEIGHT] = 1.0 if weights is None else weights.detach().numpy()
+    if mask is not None:
+        padded = ~mask.numpy()
+        side[:, :3] = np.where(padded[:, None], FAR if channels == CHANNELS else -FAR, side[:, :3])
+        side[:, WEIGHT] = np.where(padded, 0.0, side[:, WEIGHT])
+    return side
+
+
+def _normals(normals: Tensor, mask: Tensor | None, channels: int) -> np.ndarray:
+    batch, n, d = normals.shape
+    side = np.zeros((batch, channels, n), dtype=normals.detach().numpy().dtype)
+    side[:, :d] = normals.detach().numpy().transpose(0, 2, 1)
+    if mask is not None:
+        side[:, :3] = np.where(~mask.numpy()[:, None], LONG_NORMAL, side[:, :3])
+    return side
+
+
+def _put(side: np.ndarray, channel: int, vectors: Tensor) -> None:
+    side[:, channel : channel + vectors.shape[-1]] = vectors.detach().numpy().transpose(0, 2, 1)
+
+
+def _unpacked(scene: Scene, sums: Sums, order: int) -> Scene:
+    """The gradient (order 0) or, but for the temperature's own change, its rates (1)."""
+    rows, columns, pair = sums.rows[:, ROW_OUT * order :], sums.columns[:, COLUMN_OUT * order :], scene.pair
+    with_normals = pair.P_normals is not None and pair.Q_normals is not None
+    fields = CloudPair(
+        P=_field(rows, 0, pair.P, pair.P_mask),
+        Q=_field(columns, 0, pair.Q, pair.Q_mask),
+        P_normals=_field(rows, 3, pair.P, pair.P_mask) if with_normals else None,
+        Q_normals=_field(columns, 3, pair.Q, pair.Q_mask) if with_normals else None,
+        P_weights=None if pair.P_weights is None else _share(sums.row_shares[:, order], pair.P_weights, pair.P_mask),
+        Q_weights=None if pair.Q_weights is None else _share(sums.column_shares[:, order], pair.Q_weights, pair.Q_mask),
+    )
+    heat, rounding = (torch.from_numpy(rows[:, k].sum(-1)) for k in (6, 7))
+    return Scene(fields, heat / scene.temperature.square(), scene.rounding * rounding)
+
+
+def _field(table: np.ndarray, first: int, like: Tensor, mask: Tensor | None) -> Tensor:
+    """Channels of a table, from ``first``, as vectors of the shape of ``like``; 0 where padded."""
+    values = torch.from_numpy(table[:, first : first + like.shape[-1]]).mT.to(like.dtype)
+    return values if mask is None else torch.where(mask[..., None], values, 0.0)
+
+
+def _share(table: np.ndarray, like: Tensor, mask: Tensor | None) -> Tensor:
+    values = torch.from_numpy(table).to(like.dtype)
+    return values if mask is None else torch.where(mask, values, 0.0)

@@ -1,0 +1,76 @@
+"""Arithmetic of the compiled sweeps: how they are compiled, a vectorised exponential, and the channels they read."""
+
+import inspect
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic, overload
+
+# Reassociation lets sums run in vector registers; infinities and NaN never enter, inputs are checked at the door.
+FAST = {"nnan", "ninf", "nsz", "contract", "arcp", "reassoc", "afn"}
+# Columns that a row is compared with at a time: a dozen arrays of this many float32 stay in a 64 KiB cache.
+TILE = 1024
+# Rows whose sums over columns are added up in the points' own precision, before they go on in float64.
+CHUNK = 64
+# Channels of the rows (target points) and columns (moved source points): coordinates from 0, then the point's weight,
+# the inverse of its denominator in Eq. 4, the share of the loss that hangs on it, and the rates of change of both.
+WEIGHT, INVERSE, SHARE, INVERSE_RATE, SHARE_RATE, CHANNELS = 3, 4, 5, 6, 7, 8
+# Channels that only columns have: velocity of the moved point.
+VELOCITY, COLUMN_CHANNELS = 8, 11
+# Constants of an item: smoothing squared, 1 / alpha, derivatives of the loss by S and by M, 1 to align signs; then the
+# rates of change of alpha over alpha and of the two derivatives.
+SMOOTH, COOL, BY_S, BY_M, ALIGN, COOL_RATE, BY_S_RATE, BY_M_RATE, CONSTANTS = 0, 1, 2, 3, 4, 5, 6, 7, 8
+
+F32 = np.float32
+LOG2_E = F32(1 / math.log(2))
+# exp2 on [-1/2, 1/2]: Taylor coefficients ln(2)^k / k!; the first one left out is 1.2e-7 of the value at the ends.
+EXP2 = tuple(F32(math.log(2) ** k / math.factorial(k)) for k in range(7))
+LOWEST_EXPONENT, EXPONENT_BIAS, MANTISSA_BITS = F32(-126.0), np.int32(127), np.int32(23)
+HALF, ZERO, ONE, TWO = F32(0.5), F32(0.0), F32(1.0), F32(2.0)
+
+
+def compiled(**more: Any) -> Callable[[Callable], Callable]:
+    """Numba's decorator with the options of all sweeps; results are cached on disk.
+
+    Whatever wraps a function, as checks of its arguments do, is taken off first: Numba compiles what was written.
+    """
+    decorate = njit(fastmath=FAST, error_model="numpy", cache=True, nogil=True, **more)
+    return lambda function: decorate(inspect.unwrap(function))
+
+
+def _float_of_bits(typing_context, bits):  # type: ignore[no-untyped-def]
+    """The float32 with the bits of an int32."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+float_of_bits: Any = intrinsic(inspect.unwrap(_float_of_bits))
+
+
+def exp_negative(x: float) -> float:
+    """exp(x) for x <= 0, to 2e-7 in float32 (where exp(-87) and less are 1e-38), to rounding in float64."""
+    return math.exp(x)
+
+
+@overload(exp_negative, inline="never", jit_options={"fastmath": FAST})
+def _exp_negative(x):  # type: ignore[no-untyped-def]
+    if x == types.float64:
+        return lambda x: math.exp(x)
+
+    def single(x):  # type: ignore[no-untyped-def]
+        scaled = max(x * LOG2_E, LOWEST_EXPONENT)
+        whole = np.int32(scaled - HALF)  # cut towards zero: rounded to the nearest, as x <= 0
+        rest = scaled - F32(whole)
+        value = EXP2[5] + rest * EXP2[6]
+        value = EXP2[3] + rest * (EXP2[4] + rest * value)
+        value = EXP2[0] + rest * (EXP2[1] + rest * (EXP2[2] + rest * value))
+        return value * float_of_bits((whole + EXPONENT_BIAS) << MANTISSA_BITS)
+
+    return inspect.unwrap(single)

@@ -1,0 +1,134 @@
+"""What the compiled sweeps compute for one pair of points: distances, their rates of change, and slopes of the loss."""
+
+import numpy as np
+
+from bbr_layer.kernels.cpu_math import ONE, TWO, ZERO, compiled
+
+
+@compiled(forceinline=True)
+def three(array, channel, first, last):  # type: ignore[no-untyped-def]
+    """Columns ``first`` to ``last`` of three channels, as plain slices."""
+    return array[channel, first:last], array[channel + 1, first:last], array[channel + 2, first:last]
+
+
+@compiled(forceinline=True)
+def add_three(array, channel, i, vector):  # type: ignore[no-untyped-def]
+    """Add a vector to three channels of row ``i``."""
+    array[channel, i] += vector[0]
+    array[channel + 1, i] += vector[1]
+    array[channel + 2, i] += vector[2]
+
+
+@compiled(forceinline=True)
+def add_at(slices, j, vector):  # type: ignore[no-untyped-def]
+    """Add a vector to entry ``j`` of three slices."""
+    slices[0][j] += vector[0]
+    slices[1][j] += vector[1]
+    slices[2][j] += vector[2]
+
+
+@compiled(forceinline=True)
+def add_up(total, part):  # type: ignore[no-untyped-def]
+    """Add ``part`` to the first channels of ``total``, which may be more precise."""
+    for k in range(part.shape[0]):
+        for j in range(part.shape[1]):
+            total[k, j] += part[k, j]
+
+
+@compiled(forceinline=True)
+def dot(a, b):  # type: ignore[no-untyped-def]
+    """Inner product of two vectors of space."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled(forceinline=True)
+def scaled(vector, factor):  # type: ignore[no-untyped-def]
+    """A vector of space times a number."""
+    return vector[0] * factor, vector[1] * factor, vector[2] * factor
+
+
+@compiled(forceinline=True)
+def plus(a, b):  # type: ignore[no-untyped-def]
+    """The sum of two vectors of space."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@compiled(forceinline=True)
+def length(squared, smooth):  # type: ignore[no-untyped-def]
+    """Root of a square, rounded off, and its inverse; 0 and 0 at 0."""
+    total = squared + smooth
+    root = np.sqrt(total)
+    return root, (ONE / root if total > ZERO else ZERO)
+
+
+@compiled(forceinline=True)
+def plane(offset, row_normal, column_normal, align):  # type: ignore[no-untyped-def]
+    """Sign of the row's normal, the sum of the two normals (Eq. 7), and the residual along it."""
+    sign = -ONE if align * dot(row_normal, column_normal) < ZERO else ONE
+    total = (
+        column_normal[0] + sign * row_normal[0],
+        column_normal[1] + sign * row_normal[1],
+        column_normal[2] + sign * row_normal[2],
+    )
+    return sign, total, dot(offset, total)
+
+
+@compiled(forceinline=True)
+def point_of(rows, i):  # type: ignore[no-untyped-def]
+    """The first three channels of row ``i``."""
+    return rows[0, i], rows[1, i], rows[2, i]
+
+
+@compiled(forceinline=True)
+def point_distance(offset, velocity, smooth):  # type: ignore[no-untyped-def]
+    """Distance between points, and its rate."""
+    distance, over = length(dot(offset, offset), smooth)
+    return distance, dot(offset, velocity) * over
+
+
+@compiled(forceinline=True)
+def plane_distance(motion, normals, smooth, align):  # type: ignore[no-untyped-def]
+    """Distance of Eq. 7 and its rate; ``motion`` is (offset, velocity), ``normals`` (row's, column's, its velocity)."""
+    _, total, residual = plane(motion[0], normals[0], normals[1], align)
+    distance, over = length(residual * residual, smooth)
+    return distance, residual * (dot(motion[1], total) + dot(motion[0], normals[2])) * over
+
+
+@compiled(forceinline=True)
+def slope(e, distance, row, column, loss):  # type: ignore[no-untyped-def]
+    """Derivatives of the loss by u = -D / alpha of this pair, and by its distance.
+
+    ``row`` and ``column`` are (weight, inverse denominator, share), ``loss`` is (1 / alpha, by S, by M).
+    """
+    r, c = e * row[1], e * column[1]
+    buddies = row[0] * column[0] * r * c
+    by_logit = TWO * (loss[1] + loss[2] * distance) * buddies - r * row[2] - c * column[2]
+    return by_logit, loss[2] * buddies - by_logit * loss[0]
+
+
+@compiled(forceinline=True)
+def logit_rate(distance, distance_rate, cool, cool_rate):  # type: ignore[no-untyped-def]
+    """Rate of change of -D / alpha; ``cool_rate`` is that of alpha over alpha."""
+    return cool * (distance * cool_rate - distance_rate)
+
+
+@compiled(forceinline=True)
+def slope_rate(at, rates, row, column, loss):  # type: ignore[no-untyped-def]
+    """Rates of change of what ``slope`` answers, after the two themselves.
+
+    ``at`` is (e, distance), ``rates`` (of the logit, of the distance). ``row`` and ``column`` go on with the rates of
+    change of the denominator (relative) and of the share; ``loss`` with those of alpha (relative), by S and by M.
+    """
+    (e, distance), (rate, distance_rate) = at, rates
+    r, c = e * row[1], e * column[1]
+    buddies = row[0] * column[0] * r * c
+    r_rate, c_rate = rate - row[3], rate - column[3]
+    buddies_rate = buddies * (r_rate + c_rate)
+    value = loss[1] + loss[2] * distance
+    value_rate = loss[4] + loss[5] * distance + loss[2] * distance_rate
+    by_logit = TWO * value * buddies - r * row[2] - c * column[2]
+    by_logit_rate = TWO * (value_rate * buddies + value * buddies_rate)
+    by_logit_rate -= r * (r_rate * row[2] + row[4]) + c * (c_rate * column[2] + column[4])
+    by_distance = loss[2] * buddies - by_logit * loss[0]
+    by_distance_rate = loss[5] * buddies + loss[2] * buddies_rate - (by_logit_rate - by_logit * loss[3]) * loss[0]
+    return by_logit, by_distance, by_logit_rate, by_distance_rate
