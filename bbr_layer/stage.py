@@ -10,8 +10,9 @@ from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.charts import Chart, EulerAngles, RotationVector
 from bbr_layer.inner.pose_gradient import PairKernel
+from bbr_layer.inner.run import run
 from bbr_layer.inner.schedules import Constant, StepDown
-from bbr_layer.inner.unroll import Problem, cut_from_graph, run, value
+from bbr_layer.inner.unroll import Problem, cut_from_graph, value
 from bbr_layer.loss_base import Loss, Objective
 from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD, SoftBDNormals
 from bbr_layer.pair import CloudPair, Frame, centre_and_radius

@@ -35,7 +35,10 @@ ORDER = {
         inner
         inner.schedules inner.charts
         inner.adam inner.pose_gradient
-        inner.unroll
+        inner.unroll inner.adam_by_hand
+        inner.compiled_scene
+        inner.compiled
+        inner.run
         backward
         stage
         layer

@@ -1,6 +1,5 @@
-"""The inner registration itself: one step, and the steps of one stage."""
+"""One step of the inner registration."""
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,9 +14,6 @@ from bbr_layer.loss_base import Objective
 from bbr_layer.pair import Frame
 from bbr_layer.rotations import rotation_dimensions
 from bbr_layer.temperature import Temperature
-
-# Share of the steps, at the end, over which a registration must have settled to count as converged.
-SETTLED_TAIL = 0.1
 
 
 class Problem(NamedTuple):
@@ -45,12 +41,12 @@ class Progress(NamedTuple):
     def detach(self) -> "Progress":
         """The same numbers, cut from the graph."""
         return Progress(
-            _detached(self.state),
+            detached(self.state),
             self.temperature.detach(),
             self.moments.detach(),
             self.gradient_norm,
             self.best_loss.detach(),
-            _detached(self.best_state),
+            detached(self.best_state),
             self.best_temperature.detach(),
         )
 
@@ -72,7 +68,7 @@ def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
     inner, learned = problem.inner, problem.temperature.learned
     temperature = at.temperature
     if not learned:
-        temperature = problem.temperature.at(_done(at.moments.step, inner.steps), problem.unit)
+        temperature = problem.temperature.at(share_done(at.moments.step, inner.steps), problem.unit)
     loss, gradient = loss_gradient(problem, at.state, temperature, differentiable)
     d = problem.frame.target_centre.shape[-1]
     blocks = (rotation_dimensions(d), d) + ((1,) if learned else ())
@@ -82,7 +78,7 @@ def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
     move = -inner.rates(blocks, direction, at.moments.step) * direction
     pose_size = blocks[0] + blocks[1]
     state = problem.chart.moved(at.state, move[:, :pose_size])
-    later = torch.maximum(temperature + move[:, -1], _floor(problem)) if learned else temperature
+    later = torch.maximum(temperature + move[:, -1], floor(problem)) if learned else temperature
     better = (loss < at.best_loss).detach()
     return Progress(
         state,
@@ -102,7 +98,7 @@ def loss_gradient(problem: Problem, state: State, temperature: Tensor, different
         tangent = tangent_zero(batch, d, temperature.device).requires_grad_()
         warmth = torch.zeros_like(temperature).requires_grad_()
         motion = problem.chart.motion(problem.chart.moved(state, tangent), problem.frame)
-        warm = torch.maximum(temperature + warmth, _floor(problem))
+        warm = torch.maximum(temperature + warmth, floor(problem))
         leaves = (tangent, warmth) if problem.temperature.learned else (tangent,)
         cotangents: tuple[Tensor, ...]
         values: tuple[Tensor, ...]
@@ -116,39 +112,6 @@ def loss_gradient(problem: Problem, state: State, temperature: Tensor, different
         gradients = torch.autograd.grad(values, leaves, cotangents, create_graph=differentiable, materialize_grads=True)
     columns = [gradients[0]] + [g[:, None] for g in gradients[1:]]
     return loss if differentiable else loss.detach(), torch.cat(columns, dim=-1)
-
-
-def run(
-    problem: Problem, start: RigidMotion, attached: Callable[[int], bool], detached: Problem
-) -> tuple[Progress, State]:
-    """All steps of a stage, and the state a tenth of the steps before the end (to tell whether it settled).
-
-    Parameters
-    ----------
-    attached: says of each step whether it is kept differentiable.
-    problem, detached: the stage, and the same one with every input cut from the graph, for the other steps.
-    """
-    at = begin(problem, start)
-    tail = math.floor((1 - SETTLED_TAIL) * problem.inner.steps)
-    for number in range(problem.inner.steps):
-        if number == tail:
-            earlier = _detached(at.state)
-        if attached(number):
-            if number and not attached(number - 1):
-                at = at._replace(state=_fixed(at.state, problem, detached))
-            at = step(problem, at, differentiable=True)
-        else:
-            with torch.no_grad():
-                at = step(detached, at.detach(), differentiable=False)
-    if problem.inner.keep == "best":
-        at = at._replace(state=at.best_state, temperature=at.best_temperature)
-    return at, earlier
-
-
-def _fixed(state: State, problem: Problem, detached: Problem) -> State:
-    """A pose found without a graph, as one that stays put in the user's frame while the clouds' centres vary."""
-    motion = detached.frame.leave(problem.chart.motion(state, detached.frame))
-    return problem.chart.begin(motion, problem.frame)
 
 
 def cut_from_graph(problem: Problem, plain: Callable[[], Objective]) -> Problem:
@@ -165,19 +128,21 @@ def value(problem: Problem, motion: RigidMotion, temperature: Tensor) -> Tensor:
     return problem.loss(motion, temperature)
 
 
-def _floor(problem: Problem) -> Tensor:
+def floor(problem: Problem) -> Tensor:
+    """Smallest temperature ever used, ``(batch,)`` in inner units."""
     return problem.temperature.floor(problem.frame.scale)
 
 
-def _done(step: int, steps: int) -> float:
+def share_done(step: int, steps: int) -> float:
     """Share of the steps done, so that the schedule's end is met at the last one."""
     return step / max(steps - 1, 1)
-
-
-def _detached(state: State) -> State:
-    return State(*(field.detach() for field in state))
 
 
 def _chosen(which: Tensor, first: State, second: State) -> State:
     fields = zip(first, second, strict=True)
     return State(*(torch.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in fields))
+
+
+def detached(state: State) -> State:
+    """The same numbers, cut from the graph."""
+    return State(*(field.detach() for field in state))

@@ -33,12 +33,13 @@ class Backend(NamedTuple):
 class Sweeps(NamedTuple):
     """The functions of a backend, and what they can do."""
 
+    name: str
     gradient: Callable[[SoftTerms, Scene], tuple[Tensor, Scene]]
     directional: Callable[[SoftTerms, Scene, Direction], tuple[Scene, Scene]]
     supports: Callable[[SoftTerms, Scene], bool]
 
 
-TORCH = Sweeps(reference.soft_gradient, reference.soft_directional, lambda terms, scene: True)
+TORCH = Sweeps("torch", reference.soft_gradient, reference.soft_directional, lambda terms, scene: True)
 
 
 def backend(device: torch.device | str = "cpu") -> Backend:
@@ -82,4 +83,4 @@ def sweeps_for(terms: SoftTerms, scene: Scene) -> Sweeps:
 def _compiled(name: str) -> Sweeps:
     # Imported where it is first needed: both compilers take a second or more to load.
     module: ModuleType = importlib.import_module(f"bbr_layer.kernels.{'cpu' if name == 'numba' else 'gpu'}")
-    return Sweeps(module.gradient, module.directional, module.supports)
+    return Sweeps(name, module.gradient, module.directional, module.supports)

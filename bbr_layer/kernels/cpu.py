@@ -34,20 +34,21 @@ def supports(terms: SoftTerms, scene: Scene) -> bool:
 
 def gradient(terms: SoftTerms, scene: Scene) -> tuple[Tensor, Scene]:
     """As ``reference.soft_gradient``."""
-    sums = run_sweeps(GRADIENT, _packed(terms, scene, None), terms.outlier, terms.mean)
+    sums = run_sweeps(GRADIENT, pack(terms, scene), terms.outlier, terms.mean)
     return torch.from_numpy(sums.losses), _unpacked(scene, sums, 0)
 
 
 def directional(terms: SoftTerms, scene: Scene, direction: Direction) -> tuple[Scene, Scene]:
     """As ``reference.soft_directional``."""
-    sums = run_sweeps(DUAL, _packed(terms, scene, direction), terms.outlier, terms.mean)
+    sums = run_sweeps(DUAL, pack(terms, scene, direction), terms.outlier, terms.mean)
     gradient, rates = _unpacked(scene, sums, 0), _unpacked(scene, sums, 1)
     # The derivative by the temperature has alpha^2 below it, which changes too.
     cooling = 2 * gradient.temperature * direction.temperature / scene.temperature
     return gradient, rates._replace(temperature=rates.temperature - cooling)
 
 
-def _packed(terms: SoftTerms, scene: Scene, direction: Direction | None) -> Packed:
+def pack(terms: SoftTerms, scene: Scene, direction: Direction | None = None) -> Packed:
+    """A scene, and how it moves, as the sweeps read them."""
     pair = scene.pair
     rows = _side(pair.P, pair.P_weights, pair.P_mask, CHANNELS)
     columns = _side(pair.Q, pair.Q_weights, pair.Q_mask, COLUMN_CHANNELS)

@@ -26,6 +26,7 @@ from bbr_layer.kernels.cpu_pairs import (
     logit_rate,
     plane,
     point_of,
+    scaled,
     slope_rate,
     three,
 )

@@ -1,0 +1,88 @@
+"""All steps of one stage: in stretches that keep a graph or do not, compiled where that can be."""
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from bbr_layer.geometry import RigidMotion
+from bbr_layer.inner.adam import Moments
+from bbr_layer.inner.charts import RotationVector, State
+from bbr_layer.inner.pose_gradient import PairKernel
+from bbr_layer.inner.unroll import Problem, Progress, begin, detached, floor, share_done, step
+from bbr_layer.kernels.choice import backend, sweeps_for
+from bbr_layer.kernels.scene import Scene
+from bbr_layer.kernels.soft import SoftKernel
+from bbr_layer.rotations import rotation_dimensions
+
+# Share of the steps, at the end, over which a registration must have settled to count as converged.
+SETTLED_TAIL = 0.1
+
+
+def run(problem: Problem, start: RigidMotion, attached: Callable[[int], bool], cut: Problem) -> tuple[Progress, State]:
+    """All steps of a stage, and the state a tenth of the steps before the end (to tell whether it settled).
+
+    Parameters
+    ----------
+    problem, cut: the stage, and the same one with every input cut from the graph.
+    start: between the user's frames.
+    attached: says of each step whether it is kept differentiable.
+    """
+    at, steps = begin(problem, start), problem.inner.steps
+    tail = math.floor((1 - SETTLED_TAIL) * steps)
+    marks = sorted({0, tail, steps, *(k for k in range(1, steps) if attached(k) != attached(k - 1))})
+    earlier = detached(at.state)
+    for first, last in zip(marks[:-1], marks[1:], strict=True):
+        if first == tail:
+            earlier = detached(at.state)
+        if attached(first):
+            if first and not attached(first - 1):
+                at = at._replace(state=_fixed(at.state, problem, cut))
+            at = _advance(problem, at, last - first, differentiable=True)
+        else:
+            with torch.no_grad():
+                at = _advance(cut, at.detach(), last - first, differentiable=False)
+    if problem.inner.keep == "best":
+        at = at._replace(state=at.best_state, temperature=at.best_temperature)
+    return at, earlier
+
+
+def _advance(problem: Problem, at: Progress, steps: int, differentiable: bool) -> Progress:
+    if isinstance(problem.loss, PairKernel) and _compiles(problem, problem.loss):
+        return _compiled(problem, problem.loss, at, steps)
+    for _ in range(steps):
+        at = step(problem, at, differentiable)
+    return at
+
+
+def _compiles(problem: Problem, loss: PairKernel) -> bool:
+    """Whether the steps can be walked without a tensor in between."""
+    if not isinstance(loss.kernel, SoftKernel) or not isinstance(problem.chart, RotationVector):
+        return False
+    if problem.temperature.learned or problem.inner.keep != "last" or backend(loss.pair.P.device).name != "numba":
+        return False
+    scene = Scene(loss.pair, problem.unit, loss.rounding)
+    return sweeps_for(loss.kernel.terms, scene).name == "numba"
+
+
+def _compiled(problem: Problem, loss: PairKernel, at: Progress, steps: int) -> Progress:
+    from bbr_layer.inner.compiled import Steps, walk  # Numba takes a second to load: only where it is used
+
+    inner, done, d = problem.inner, at.moments.step, at.state.translation.shape[-1]
+    blocks = rotation_dimensions(d), d
+    shares = [share_done(number, inner.steps) for number in range(done, done + steps)]
+    lowest = floor(problem)
+    temperatures = torch.stack([torch.maximum(problem.temperature.at(x, problem.unit), lowest) for x in shares])
+    rates = torch.stack([inner.rates(blocks, at.moments.first, number) for number in range(done, done + steps)])
+    assert isinstance(loss.kernel, SoftKernel)
+    begun = (*at.state, at.moments.first, at.moments.second)
+    end = walk(Steps(loss.kernel.terms, inner, done), (loss.pair, loss.rounding), begun, temperatures, rates)
+    moments = Moments(end.first, end.second, done + steps)
+    state = State(end.rotation, end.translation)
+    return at._replace(state=state, temperature=temperatures[-1], moments=moments, gradient_norm=end.gradient_norm)
+
+
+def _fixed(state: State, problem: Problem, cut: Problem) -> State:
+    """A pose found without a graph, as one that stays put in the user's frame while the clouds' centres vary."""
+    motion = cut.frame.leave(problem.chart.motion(state, cut.frame))
+    return problem.chart.begin(motion, problem.frame)
