@@ -3,6 +3,7 @@
 from bbr_layer.atomic import atomic_write as atomic_write
 from bbr_layer.backward import Autograd as Autograd
 from bbr_layer.backward import Detached as Detached
+from bbr_layer.backward import Implicit as Implicit
 from bbr_layer.backward import Replay as Replay
 from bbr_layer.backward import Truncated as Truncated
 from bbr_layer.buddies import hard_buddies as hard_buddies

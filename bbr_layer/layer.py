@@ -1,24 +1,21 @@
 """Best Buddies Registration (Drory, Shomer, Avidan, Giryes, ACCV 2020) as a differentiable layer."""
 
-import logging
 from contextlib import nullcontext
 from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from bbr_layer.backward import Backward, Detached, Replay
+from bbr_layer.backward import Backward, Detached, Implicit, Replay, speak_up
 from bbr_layer.door import batch_shape, checked_pair, checked_start
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam
-from bbr_layer.normals import estimate_normals, point_spacing
-from bbr_layer.pair import CloudPair, Frame, into_frame
+from bbr_layer.pair import CloudPair, Frame
+from bbr_layer.preparation import begun_at, prepared
 from bbr_layer.registration import Registration, judge, matched_information
-from bbr_layer.stage import Stage, default_stages, named_stage, paper_stage
-from bbr_layer.start import better_start
+from bbr_layer.stage import Stage, StageResult, default_stages, named_stage, paper_stage
 from bbr_layer.temperature import Temperature
-
-LOGGER = logging.getLogger("bbr_layer")
+from bbr_layer.transforms import is_transformed, registered
 
 
 class BBRLayer(nn.Module):
@@ -28,8 +25,8 @@ class BBRLayer(nn.Module):
     ----------
     stages: ``Stage`` objects, each starting where the last one ended; or one of the paper's names ``"softBBS"``,
         ``"softBD"``, ``"N"``, ``"F"`` for a single scale-free stage. None: the measured default, softBBS then F.
-    backward: how gradients reach the inputs: ``Replay()`` (default), ``Truncated(last_steps)``, ``Autograd()`` or
-        ``Detached()``.
+    backward: how gradients reach the inputs: ``Replay()`` (default, exact), ``Truncated(last_steps)``,
+        ``Implicit()``, ``Autograd()`` (second derivatives) or ``Detached()``.
     inner, temperature: settings of the one stage that is given by name.
 
     Raises
@@ -107,6 +104,12 @@ class BBRLayer(nn.Module):
         ValueError: one sentence on what is wrong with which argument.
         """
         given = CloudPair(P, Q, P_normals, Q_normals, P_features, Q_features, P_weights, Q_weights, P_mask, Q_mask)
+        return self._called(given, start)
+
+    @torch.compiler.disable  # trees and compiled sweeps are nothing to trace; what is around the layer compiles
+    def _called(self, given: CloudPair, start: RigidMotion | None) -> Registration:
+        if is_transformed(given, start):
+            return registered(self._entered, given, start)
         return self._entered(given, start)
 
     def _entered(self, given: CloudPair, start: RigidMotion | None) -> Registration:
@@ -122,51 +125,30 @@ class BBRLayer(nn.Module):
         return result.reshape(batch_shape(given.P))
 
     def _register(self, given: CloudPair, start: RigidMotion | None, differentiable: bool) -> Registration:
-        frame, pair = into_frame(given, self.scaled)
-        pair = self._with_normals(self._with_spacing(pair))
-        motion = self._start(pair, frame, start)
+        needs_normals = any(stage.loss.needs_normals for stage in self.sequence)
+        frame, pair = prepared(given, needs_normals, self.scaled)
+        motion = begun_at(start, pair, frame, self.scaled)
         mode = self.backward_mode if differentiable else Detached()
-        stages = self.sequence
-        steps, done = sum(stage.inner.steps for stage in stages), 0
-        for stage in stages:
-            attached = partial(_attached, mode, done, steps)
-            ended = stage(pair, frame, motion, attached, closed_form=mode.closed_form)
+        ended = self._descend(pair, frame, motion, mode)
+        if isinstance(mode, Implicit):
+            ended, doubt = self.sequence[-1].attach(pair, frame, ended, mode.damping)
+            if doubt and mode.on_unconverged == "replay":
+                ended = self._descend(pair, frame, motion, Replay())
+            elif doubt:
+                speak_up(mode, doubt)
+        buddies, information = matched_information(pair, frame.enter(ended.motion), frame)
+        status = judge(ended.motion, buddies, information, frame, ended.settled)
+        iterations = torch.full_like(buddies, sum(stage.inner.steps for stage in self.sequence))
+        found = ended.loss, ended.temperature, ended.gradient_norm
+        return Registration(ended.motion, *found, iterations, buddies, information, status)
+
+    def _descend(self, pair: CloudPair, frame: Frame, motion: RigidMotion, mode: Backward) -> StageResult:
+        """All stages, each from where the last one ended."""
+        steps, done = sum(stage.inner.steps for stage in self.sequence), 0
+        for stage in self.sequence:
+            ended = stage(pair, frame, motion, partial(_attached, mode, done, steps), closed_form=mode.closed_form)
             motion, done = ended.motion, done + stage.inner.steps
-        buddies, information = matched_information(pair, frame.enter(motion), frame)
-        status = judge(motion, buddies, information, frame, ended.settled)
-        iterations = torch.full_like(buddies, steps)
-        return Registration(
-            motion,
-            ended.loss,
-            ended.temperature,
-            ended.gradient_norm,
-            iterations,
-            buddies,
-            information,
-            status,
-        )
-
-    def _start(self, pair: CloudPair, frame: Frame, start: RigidMotion | None) -> RigidMotion:
-        if start is not None:
-            return start
-        if not self.scaled:
-            return RigidMotion.identity(pair.P.shape[-1], pair.P.shape[:1], device=pair.P.device)
-        return better_start(pair, frame)
-
-    def _with_spacing(self, pair: CloudPair) -> CloudPair:
-        spacing = (point_spacing(pair.P, pair.P_mask) + point_spacing(pair.Q, pair.Q_mask)) / 2
-        return pair._replace(spacing=torch.where(spacing > 0, spacing, 1.0))
-
-    def _with_normals(self, pair: CloudPair) -> CloudPair:
-        if not any(stage.loss.needs_normals for stage in self.sequence):
-            return pair
-        if pair.P_normals is None or pair.Q_normals is None:
-            LOGGER.info("normals were not given and are estimated from the clouds themselves")
-        if pair.P_normals is None:
-            pair = pair._replace(P_normals=estimate_normals(pair.P, mask=pair.P_mask))
-        if pair.Q_normals is None:
-            pair = pair._replace(Q_normals=estimate_normals(pair.Q, mask=pair.Q_mask))
-        return pair
+        return ended
 
     def _wants_gradient(self, pair: CloudPair, start: RigidMotion | None) -> bool:
         settings = [x for m in self.modules() for x in vars(m).values() if isinstance(x, Tensor)]

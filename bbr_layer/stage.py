@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.charts import Chart, EulerAngles, RotationVector
+from bbr_layer.inner.implicit import attach, doubt
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.run import run
 from bbr_layer.inner.schedules import Constant, StepDown
@@ -76,6 +77,14 @@ class Stage(nn.Module):
         loss = value(problem, motion, final)
         settled = _settled(self.chart.motion(earlier, frame), motion, pair)
         return StageResult(reached.frame.leave(motion), loss, final * frame.scale, end.gradient_norm, settled)
+
+    def attach(self, pair: CloudPair, frame: Frame, ended: StageResult, damping: float) -> tuple[StageResult, str]:
+        """The result with the derivative of an optimum, and in words why it may not be one; "" if it is."""
+        problem = self._problem(pair, frame, closed_form=True)
+        temperature = (ended.temperature / frame.scale).detach()
+        attached = attach(problem, pair, ended.motion, temperature, damping)
+        loss = value(problem, frame.enter(attached.motion), temperature)
+        return ended._replace(motion=attached.motion, loss=loss), doubt(attached)
 
     def _problem(self, pair: CloudPair, frame: Frame, closed_form: bool) -> Problem:
         unit = self.loss.temperature_unit(pair).double()

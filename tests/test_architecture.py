@@ -33,13 +33,13 @@ ORDER = {
         losses
         registration start door
         inner
-        inner.schedules inner.charts
+        inner.schedules inner.charts inner.once
         inner.adam inner.pose_gradient
         inner.unroll inner.adam_by_hand
         inner.compiled_scene
         inner.compiled
-        inner.run
-        backward
+        inner.run inner.implicit
+        backward transforms preparation
         stage
         layer
         atomic cloud_columns

@@ -13,6 +13,7 @@ from torch import Tensor
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.adam_by_hand import HandAdam, Point, Taken
 from bbr_layer.inner.compiled_scene import CompiledScene
+from bbr_layer.inner.once import once
 from bbr_layer.kernels.scene import SoftTerms
 from bbr_layer.pair import CloudPair
 
@@ -80,6 +81,13 @@ class _Walk(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Any, ...]:
+        with torch.no_grad():
+            found = _Walk.pulled_back(ctx, cotangents)
+        return None, *once(found, (*ctx.saved_tensors, *cotangents))
+
+    @staticmethod
+    def pulled_back(ctx: Any, cotangents: tuple[Tensor, ...]) -> list[Tensor | None]:
+        """Cotangents of everything that is saved, in order."""
         rounding, temperatures, rates, rotation, translation, _, _, *fields = ctx.saved_tensors
         pair, d, steps = CloudPair._make(fields), translation.shape[-1], ctx.steps
         scene, adam = CompiledScene(steps.terms, pair, rounding), HandAdam(steps.inner, d)
@@ -98,7 +106,7 @@ class _Walk(torch.autograd.Function):
         by_pose = [torch.from_numpy(np.ascontiguousarray(x)) for x in pose]
         by_lengths = [torch.from_numpy(x) for x in (totals.rounding, heats, speeds)]
         by_fields = [_as_field(totals, name, getattr(pair, name)) for name in CloudPair._fields]
-        return None, *by_lengths, *by_pose, *by_fields
+        return [*by_lengths, *by_pose, *by_fields]
 
 
 def _as_field(totals: Any, name: str, field: Tensor | None) -> Tensor | None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
+from bbr_layer.inner.once import once
 from bbr_layer.kernels.scene import Direction, Kernel, Scene
 from bbr_layer.pair import CloudPair
 
@@ -65,6 +66,13 @@ class _Slope(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Any, ...]:
+        with torch.no_grad():
+            found = _Slope.pulled_back(ctx, cotangents)
+        return None, *once(found, (*ctx.saved_tensors, *cotangents)), None, None, None
+
+    @staticmethod
+    def pulled_back(ctx: Any, cotangents: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
+        """Cotangents of rounding, temperature, motion and the differentiable fields of the pair."""
         rounding, temperature, *rest = ctx.saved_tensors
         motion, pair = RigidMotion(*rest[:2]), CloudPair._make(rest[2:])
         scene = Scene(pair.moved_by(motion), temperature, rounding)
@@ -83,7 +91,7 @@ class _Slope(torch.autograd.Function):
         if by_loss is not None:
             total = _sum(total, _scaled(gradient, by_loss))
         fields = _into_own_frame(total.pair, gradient.pair, motion, along)
-        return None, total.rounding, total.temperature, *_by_motion(total.pair, pair), *fields, None, None, None
+        return total.rounding, total.temperature, *_by_motion(total.pair, pair), *fields
 
 
 def _turned(along: RigidMotion, normals: Tensor | None) -> Tensor | None:
