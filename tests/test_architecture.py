@@ -21,10 +21,10 @@ ORDER = {
         kernels
         kernels.scene
         kernels.blocks kernels.forward_mode
-        kernels.reference kernels.matched kernels.cpu_math
-        kernels.cpu_pairs kernels.cpu_items
-        kernels.cpu_sweeps kernels.cpu_dual kernels.cpu_dual_forces
-        kernels.cpu_dual_planes
+        kernels.reference kernels.matched kernels.cpu_math kernels.gpu_pairs
+        kernels.cpu_pairs kernels.cpu_items kernels.gpu_sweeps kernels.gpu_clouds
+        kernels.cpu_sweeps kernels.cpu_dual kernels.cpu_dual_forces kernels.gpu_forces
+        kernels.cpu_dual_planes kernels.gpu
         kernels.cpu_batch
         kernels.cpu
         kernels.choice

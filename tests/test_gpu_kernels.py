@@ -1,0 +1,69 @@
+"""The sweeps in Triton against those in torch: in Triton's interpreter everywhere, on a GPU where there is one."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from gpu_problems import INTERPRETED, PRECISIONS, PROBLEMS, cast, error, scene_of
+
+PROJECT = Path(__file__).resolve().parent.parent
+# Errors relative to the largest number of a field. In float32, u = -D / alpha carries an error of 6e-8 |u|, the
+# exponential as much relative to itself, and derivatives of a mean are differences of such numbers.
+WITHIN = {"float64": 1e-10, "float32": 1e-4}
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
+
+
+@pytest.fixture(scope="module")
+def interpreted() -> dict[str, Any]:
+    """The errors in the interpreter; Triton has to know before it is imported, so another process computes them."""
+    paths = os.pathsep.join([str(PROJECT), str(PROJECT / "tests")])
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(PROJECT / "tests" / "gpu_problems.py")]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout)
+
+
+@pytest.mark.parametrize(("name", "precision"), INTERPRETED)
+def test_the_sweeps_agree_with_torch(name, precision, interpreted):
+    (found,) = [found for *which, found in interpreted["errors"] if which == [name, precision]]
+    assert found < WITHIN[precision]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_sweeps_agree_with_torch_on_a_gpu(name, precision):
+    assert error(name, precision, "cuda") < WITHIN[precision]
+
+
+@pytest.mark.parametrize(
+    ("change", "possible"),
+    [
+        ({}, True),
+        ({"planes": True}, True),
+        ({"match": "both"}, False),
+        ({"clip": 3.0}, False),
+        ({"outlier": 0.0}, False),
+        ({"outlier": 1e-30}, False),  # below what a float32 exponential can be compared with
+    ],
+)
+def test_what_cannot_be_done_is_left_to_torch(change, possible):
+
+    from bbr_layer.kernels.gpu import gpu_supports
+
+    scene, _ = scene_of(PROBLEMS["softBD"])
+    terms = PROBLEMS["softBD"].terms._replace(**change)
+    assert gpu_supports(terms, cast(scene, torch.float32, "cpu")) == possible
+
+
+def test_importing_the_layer_leaves_triton_alone(interpreted):
+    assert interpreted["unasked"] is False
