@@ -45,6 +45,25 @@ def test_the_sweeps_agree_with_torch_on_a_gpu(name, precision):
     assert error(name, precision, "cuda") < WITHIN[precision]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", range(4))
+def test_the_sweeps_compile_for_a_gpu_that_is_not_there(kind, tmp_path, monkeypatch):
+    from triton import compile
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    from bbr_layer.kernels.gpu_forces import forces
+    from bbr_layer.kernels.gpu_sweeps import buddy_sums, denominators
+
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    pointers = {"own": "*fp32", "other": "*fp32", "numbers": "*fp64", "out": "*fp64", "KIND": "constexpr"}
+    for sweep in (denominators, buddy_sums, forces):
+        source = ASTSource(sweep, signature=pointers, constexprs={"KIND": kind})
+        # sm_90 is an H100; the options are those of kernels.gpu_clouds.
+        built = compile(source, target=GPUTarget("cuda", 90, 32), options={"num_warps": 4, "enable_fp_fusion": True})
+        assert built.asm["cubin"]
+
+
 @pytest.mark.parametrize(
     ("change", "possible"),
     [
