@@ -34,8 +34,10 @@ FORCE_SUMS = tl.constexpr(8)
 @no_type_check
 def slopes(own, other, item, at):
     """Own and other factor of the buddies, buddies, and the derivatives of the loss by -D / alpha and by D."""
-    (_, weight, inverse, share, _, _), (_, other_weight, other_inverse, other_share, _, _) = own[4], other[4]
-    e, distance, (cool, by_S, by_M) = at[0], at[1], item[2]
+    weight, inverse, share = own[4][1], own[4][2], own[4][3]
+    other_weight, other_inverse, other_share = other[4][1], other[4][2], other[4][3]
+    e, distance = at[0], at[1]
+    cool, by_S, by_M = item[2]
     r, c = e * inverse, e * other_inverse
     buddies = r * c * (weight * other_weight)
     by_logit = 2.0 * (by_S + by_M * distance) * buddies - r * share - c * other_share
@@ -49,8 +51,11 @@ def slope_rates(factors, item, distance, now, rates):
 
     ``factors`` are (own[4], other[4]), ``now`` what ``slopes`` answered, ``rates`` what ``tile_rates`` answered.
     """
-    (_, _, _, share, inverse_rate, share_rate), (_, _, _, other_share, other_inverse_rate, other_share_rate) = factors
-    (cool, by_S, by_M), (cool_rate, by_S_rate, by_M_rate), (r, c, buddies, by_logit, _) = item[2], item[3], now
+    share, inverse_rate, share_rate = factors[0][3], factors[0][4], factors[0][5]
+    other_share, other_inverse_rate, other_share_rate = factors[1][3], factors[1][4], factors[1][5]
+    cool, by_S, by_M = item[2]
+    cool_rate, by_S_rate, by_M_rate = item[3]
+    r, c, buddies, by_logit = now[0], now[1], now[2], now[3]
     r_change, c_change = rates[0] - inverse_rate, rates[0] - other_inverse_rate
     buddies_rate = buddies * (r_change + c_change)
     value_rate = by_S_rate + by_M_rate * distance + by_M * rates[1]

@@ -113,7 +113,7 @@ def tile(own, other, item, KIND: tl.constexpr):
     the residual of Eq. 7. Of the exponential nothing is subtracted first: distances are not negative, and the epsilon
     of Eq. 4 keeps the denominators above 0. Where a point is not real it is 0.
     """
-    (a, n, _, _, mine), (b, m, _, _, theirs) = own, other
+    a, n, b, m = own[0], own[1], other[0], other[1]
     offset = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     squared = dot(offset, offset)
     sign = squared * 0.0 + 1.0
@@ -125,7 +125,7 @@ def tile(own, other, item, KIND: tl.constexpr):
         squared = residual * residual
     distance = tl.sqrt(squared + item[0])
     over = tl.where(distance > 0.0, 1.0 / tl.where(distance > 0.0, distance, 1.0), 0.0)
-    e = mine[0] * theirs[0] * tl.exp(-distance * item[2][0])
+    e = own[4][0] * other[4][0] * tl.exp(-distance * item[2][0])
     return e, distance, over, offset, along, residual, sign
 
 
@@ -133,8 +133,8 @@ def tile(own, other, item, KIND: tl.constexpr):
 @no_type_check
 def tile_rates(own, other, item, at, KIND: tl.constexpr):
     """Rates of change of -D / alpha, distance, offset, direction, residual; ``at`` is what ``tile`` answered."""
-    (_, _, a, n, _), (_, _, b, m, _) = own, other
-    _, distance, over, offset, along, residual, sign = at
+    a, n, b, m = own[2], own[3], other[2], other[3]
+    e, distance, over, offset, along, residual, sign = at
     velocity = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     along_rate, residual_rate = velocity, residual * 0.0
     distance_rate = dot(offset, velocity) * over
