@@ -77,11 +77,11 @@ def test_the_sweeps_compile_for_a_gpu_that_is_not_there(kind, tmp_path, monkeypa
 )
 def test_what_cannot_be_done_is_left_to_torch(change, possible):
 
-    from bbr_layer.kernels.gpu import gpu_supports
+    from bbr_layer.kernels.gpu import supports
 
     scene, _ = scene_of(PROBLEMS["softBD"])
     terms = PROBLEMS["softBD"].terms._replace(**change)
-    assert gpu_supports(terms, cast(scene, torch.float32, "cpu")) == possible
+    assert supports(terms, cast(scene, torch.float32, "cpu")) == possible
 
 
 def test_importing_the_layer_leaves_triton_alone(interpreted):

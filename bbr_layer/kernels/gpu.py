@@ -32,7 +32,7 @@ class _Sums(NamedTuple):
     temperature: Tensor
 
 
-def gpu_supports(terms: SoftTerms, scene: Scene) -> bool:
+def supports(terms: SoftTerms, scene: Scene) -> bool:
     """Whether the sweeps here can do what is asked; ``kernels.reference`` can do the rest."""
     dtype = scene.pair.P.dtype
     if dtype not in (torch.float32, torch.float64) or terms.match != "points" or terms.clip is not None:
@@ -43,14 +43,14 @@ def gpu_supports(terms: SoftTerms, scene: Scene) -> bool:
 
 
 @torch.no_grad()
-def gpu_gradient(terms: SoftTerms, scene: Scene) -> tuple[Tensor, Scene]:
+def gradient(terms: SoftTerms, scene: Scene) -> tuple[Tensor, Scene]:
     """Loss ``(batch,)`` float64 and gradient in closed form."""
     loss, sums = _sums(terms, scene, None)
     return loss, _as_scene(terms, scene, sums[0])
 
 
 @torch.no_grad()
-def gpu_directional(terms: SoftTerms, scene: Scene, direction: Direction) -> tuple[Scene, Scene]:
+def directional(terms: SoftTerms, scene: Scene, direction: Direction) -> tuple[Scene, Scene]:
     """The gradient and its derivative along ``direction``."""
     _, (sums, rates) = _sums(terms, scene, direction)
     return _as_scene(terms, scene, sums), _as_scene(terms, scene, rates)

@@ -1,0 +1,117 @@
+"""How fast the compiled sweeps are: against the processor's own primitives, over threads, and over a training batch."""
+
+import time
+from collections.abc import Callable
+
+import numba
+import numpy as np
+import torch
+
+from bbr_layer import Adam, BBRLayer, Replay
+from bbr_layer.kernels import cpu
+from bbr_layer.kernels.cpu_math import FAST, exp_negative
+from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
+from bbr_layer.pair import CloudPair
+from benchmarks.layer_problems import clouds
+
+PRIMITIVES_NOTE = (
+    "Nanoseconds per pair on one thread, n = m = 1000, float32. The bound is what the arithmetic alone costs here: three "
+    "exponentials with their square roots, and one division, each measured over an array in the first cache."
+)
+NUMBERS = 2048  # float32 numbers of one array of the primitives: 8 KiB
+REPEATS = 7
+
+
+def best(function: Callable[[], object], inner: int) -> float:
+    """Seconds of one call: the best of a few runs of ``inner`` calls."""
+    function()
+    times = []
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        for _ in range(inner):
+            function()
+        times.append((time.perf_counter() - begin) / inner)
+    return min(times)
+
+
+@numba.njit(fastmath=FAST, error_model="numpy")
+def exp_root(x, out):  # type: ignore[no-untyped-def]
+    """exp(-sqrt(x)), the core of every sweep."""
+    for _ in range(100):
+        for i in range(x.size):
+            out[i] += exp_negative(-np.sqrt(x[i]))
+
+
+@numba.njit(fastmath=FAST, error_model="numpy")
+def divide(x, out):  # type: ignore[no-untyped-def]
+    """A division per number."""
+    for _ in range(100):
+        for i in range(x.size):
+            out[i] += np.float32(1) / x[i]
+
+
+def sweep_rows() -> list[str]:
+    """Gradient and directional derivative of softBD and N beside the primitives."""
+    torch.set_num_threads(1)
+    x = np.random.default_rng(0).random(NUMBERS).astype(np.float32) + np.float32(0.5)
+    out = np.zeros_like(x)
+    root, division = (best(lambda f=f: f(x, out), 20) / (100 * NUMBERS) * 1e9 for f in (exp_root, divide))
+    bound = 3 * root + division
+    rows = ["| what | ns per pair | over the bound |", "|---|---|---|"]
+    rows.append(f"| exponential with square root | {root:.2f} | |")
+    rows.append(f"| division | {division:.2f} | |")
+    rows.append(f"| bound of a gradient | {bound:.2f} | 1.00 |")
+    for name, terms in (("softBD", SoftTerms(True, outlier=1e-10)), ("N", SoftTerms(True, True, outlier=1e-10))):
+        P, Q = (cloud[None] for cloud in clouds(1000))
+        lengths = torch.tensor([0.1], dtype=torch.float64), torch.tensor([0.01], dtype=torch.float64)
+        scene = Scene(CloudPair(P, Q, P, Q), *lengths)
+        direction = Direction(torch.ones_like(Q), torch.ones_like(Q), torch.zeros(1, dtype=torch.float64))
+        calls = {
+            "gradient": lambda scene=scene, terms=terms: cpu.gradient(terms, scene),
+            "directional derivative": lambda scene=scene, terms=terms, d=direction: cpu.directional(terms, scene, d),
+        }
+        for what, call in calls.items():
+            spent = best(call, 5) / 1e6 * 1e9
+            rows.append(f"| {name}, {what} | {spent:.2f} | {spent / bound:.2f} |")
+    return rows
+
+
+def _registration(batch: int, steps: int) -> Callable[[], object]:
+    P, Q = (cloud.requires_grad_() for cloud in clouds(512, batch))
+    layer = BBRLayer("softBD", inner=Adam(steps, 0.05), backward=Replay())
+    return lambda: torch.autograd.grad(layer(P, Q).target_from_source.matrix.square().sum(), (P, Q))
+
+
+def thread_rows() -> list[str]:
+    """The same batch on one thread and on two."""
+    rows, alone = ["| threads | seconds | speed-up |", "|---|---|---|"], 0.0
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        spent = best(_registration(8, 30), 1)
+        alone = alone or spent
+        rows.append(f"| {threads} | {spent:.3f} | {alone / spent:.2f} |")
+    return rows
+
+
+def batch_rows() -> list[str]:
+    """Pairs per second, forward and backward, on all threads."""
+    rows = ["| device | threads | seconds | pairs per second |", "|---|---|---|---|"]
+    torch.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    run = _registration(64, 100)
+    begin = time.perf_counter()
+    run()
+    spent = time.perf_counter() - begin
+    rows.append(f"| CPU | {torch.get_num_threads()} | {spent:.2f} | {64 / spent:.1f} |")
+    if torch.cuda.is_available():
+        P, Q = (cloud.cuda().requires_grad_() for cloud in clouds(512, 64))
+        layer = BBRLayer("softBD", inner=Adam(100, 0.05))
+        for _ in range(2):  # the first run compiles
+            torch.cuda.synchronize()
+            begin = time.perf_counter()
+            torch.autograd.grad(layer(P, Q).target_from_source.matrix.square().sum(), (P, Q))
+            torch.cuda.synchronize()
+            spent = time.perf_counter() - begin
+        rows.append(f"| {torch.cuda.get_device_name()} | | {spent:.2f} | {64 / spent:.1f} |")
+    else:
+        rows.append("| GPU | | none here | |")
+    return rows
