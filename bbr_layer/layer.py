@@ -104,9 +104,12 @@ class BBRLayer(nn.Module):
         ValueError: one sentence on what is wrong with which argument.
         """
         given = CloudPair(P, Q, P_normals, Q_normals, P_features, Q_features, P_weights, Q_weights, P_mask, Q_mask)
+        if torch.compiler.is_compiling():
+            # Trees and compiled sweeps are nothing to trace. Not as a decorator, which would load the compiler into
+            # every program that imports the layer.
+            return torch.compiler.disable(self._called)(given, start)
         return self._called(given, start)
 
-    @torch.compiler.disable  # trees and compiled sweeps are nothing to trace; what is around the layer compiles
     def _called(self, given: CloudPair, start: RigidMotion | None) -> Registration:
         if is_transformed(given, start):
             return registered(self._entered, given, start)

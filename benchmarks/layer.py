@@ -126,11 +126,7 @@ def main() -> None:
         ("Speed and memory", f"T = {STEPS}, one thread, float32.", lambda: speed_rows(options.sizes, options.losses)),
         ("Memory against steps", "", memory_rows),
         ("The sweeps", layer_sweeps.PRIMITIVES_NOTE, layer_sweeps.sweep_rows),
-        (
-            "Threads",
-            "A batch of 8 pairs of 512 points, softBD, 30 steps, forward + backward.",
-            layer_sweeps.thread_rows,
-        ),
+        ("Threads", layer_sweeps.THREADS_NOTE, layer_sweeps.thread_rows),
         ("A training batch", "64 pairs of 512 points, softBD, 100 steps, float32.", layer_sweeps.batch_rows),
         ("Gradients", layer_gradients.NOTE, layer_gradients.error_rows),
     ]

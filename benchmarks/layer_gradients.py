@@ -7,9 +7,9 @@ from bbr_layer import Adam, Annealed, Autograd, BBRLayer, Implicit, Replay
 from benchmarks.layer_problems import clouds
 
 NOTE = (
-    "Relative errors of the gradient by both clouds (norms). Against `Autograd()` in float64 at n = m = 200, T = 30; of "
-    "float32 against float64 at n = m = 1000, softBD, as given and with both clouds shifted by 1000 radii; of `Implicit()` "
-    "by the points' weights at n = m = 100 after 900 steps."
+    "Relative errors of the gradient by both clouds (norms). Against `Autograd()` in float64 at n = m = 200, T = 30; "
+    "of float32 against float64 at n = m = 1000, softBD, as given and with both clouds shifted by 1000 radii; of "
+    "`Implicit()` by the points' weights at n = m = 100 after 900 steps."
 )
 
 
@@ -33,9 +33,8 @@ def error_rows() -> list[str]:
     rows = ["| gradient | against | relative error |", "|---|---|---|"]
     for name in ("softBBS", "softBD", "N", "F"):
         pair = clouds(200, dtype=torch.float64)
-        found, wanted = (
-            gradient(BBRLayer(name, inner=Adam(30, 0.05), backward=m), *pair) for m in (Replay(), Autograd())
-        )
+        layers = [BBRLayer(name, inner=Adam(30, 0.05), backward=mode) for mode in (Replay(), Autograd())]
+        found, wanted = (gradient(layer, *pair) for layer in layers)
         rows.append(f"| Replay, {name} | Autograd | {difference(found, wanted)} |")
         print(rows[-1], flush=True)
     for steps in (30, 100):
@@ -44,9 +43,8 @@ def error_rows() -> list[str]:
         rows.append(f"| float32, T = {steps} | float64 | {difference(gradient(layer, *clouds(1000)), wanted)} |")
         shifted = clouds(1000, shift=1000.0)
         far = gradient(layer, *(x.double() for x in shifted))
-        rows.append(
-            f"| float32, T = {steps}, shifted | float64, shifted | {difference(gradient(layer, *shifted), far)} |"
-        )
+        error = difference(gradient(layer, *shifted), far)
+        rows.append(f"| float32, T = {steps}, shifted | float64, shifted | {error} |")
         print(*rows[-2:], sep="\n", flush=True)
     rows.append(f"| Implicit, by weights | Replay | {_implicit()} |")
     return rows
