@@ -36,8 +36,8 @@ ORDER = {
         inner.schedules inner.charts inner.once
         inner.adam inner.pose_gradient
         inner.unroll inner.adam_by_hand
-        inner.compiled_scene
-        inner.compiled
+        inner.compiled_scene inner.matched_scene
+        inner.walk
         inner.run inner.implicit
         backward transforms preparation
         stage

@@ -33,6 +33,27 @@ class Taken(NamedTuple):
     after: Point
 
 
+class Totals(NamedTuple):
+    """Cotangents of everything but the pose, added up over the steps; float64, channels before points.
+
+    ``P, P_normals (b, 3, n)``, ``Q, Q_normals (b, 3, m)``, weights ``(b, n)`` and ``(b, m)``, ``rounding (b,)``.
+    """
+
+    P: np.ndarray
+    Q: np.ndarray
+    P_normals: np.ndarray
+    Q_normals: np.ndarray
+    P_weights: np.ndarray
+    Q_weights: np.ndarray
+    rounding: np.ndarray
+
+    @staticmethod
+    def zero(batch: int, n: int, m: int) -> "Totals":
+        """Zeros for clouds of n and m points."""
+        vectors, numbers = ((batch, 3, n), (batch, 3, m)), ((batch, n), (batch, m))
+        return Totals(*(np.zeros(shape) for shape in (*vectors, *vectors, *numbers, (batch,))))
+
+
 class HandAdam:
     """The inner optimiser's steps and their adjoints.
 

@@ -1,32 +1,15 @@
 """A pair of clouds packed once for the compiled sweeps, and looked at from one pose after the other."""
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from bbr_layer.inner.adam_by_hand import Point, axial, hat, transposed
+from bbr_layer.inner.adam_by_hand import Point, Totals, axial, hat, transposed
 from bbr_layer.kernels.cpu import FAR, LONG_NORMAL, pack
 from bbr_layer.kernels.cpu_batch import COLUMN_OUT, DUAL, GRADIENT, ROW_OUT, Sums, run_sweeps
 from bbr_layer.kernels.cpu_math import COOL, VELOCITY
 from bbr_layer.kernels.scene import Scene, SoftTerms
 from bbr_layer.pair import CloudPair
-
-
-class Totals(NamedTuple):
-    """Cotangents of everything but the pose, added up over the steps; float64, channels before points.
-
-    ``P, P_normals (b, 3, n)``, ``Q, Q_normals (b, 3, m)``, weights ``(b, n)`` and ``(b, m)``, ``rounding (b,)``.
-    """
-
-    P: np.ndarray
-    Q: np.ndarray
-    P_normals: np.ndarray
-    Q_normals: np.ndarray
-    P_weights: np.ndarray
-    Q_weights: np.ndarray
-    rounding: np.ndarray
 
 
 class CompiledScene:
@@ -49,10 +32,7 @@ class CompiledScene:
 
     def totals(self) -> Totals:
         """Zeros, to be added to."""
-        (batch, _, n), m = self.packed.rows.shape, self.points.shape[2]
-        rows, columns = ((batch, 3, n), (batch, n)), ((batch, 3, m), (batch, m))
-        shapes = rows[0], columns[0], rows[0], columns[0], rows[1], columns[1], (batch,)
-        return Totals(*(np.zeros(shape) for shape in shapes))
+        return Totals.zero(len(self.packed.rows), self.packed.rows.shape[2], self.points.shape[2])
 
     def slope(self, at: Point, temperature: np.ndarray) -> np.ndarray:
         """The loss's gradient by a further turn and shift of the pose, ``(batch, 6)``."""

@@ -2,17 +2,23 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
+from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Moments
 from bbr_layer.inner.charts import RotationVector, State
+from bbr_layer.inner.matched_scene import MatchedScene
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.unroll import Problem, Progress, begin, detached, floor, share_done, step
-from bbr_layer.kernels.choice import backend, sweeps_for
-from bbr_layer.kernels.scene import Scene
+from bbr_layer.inner.walk import Scene, Steps, walk
+from bbr_layer.kernels import scene as kernel_scene
+from bbr_layer.kernels.choice import sweeps_for
+from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.soft import SoftKernel
+from bbr_layer.pair import CloudPair
 from bbr_layer.rotations import rotation_dimensions
 
 # Share of the steps, at the end, over which a registration must have settled to count as converged.
@@ -48,35 +54,42 @@ def run(problem: Problem, start: RigidMotion, attached: Callable[[int], bool], c
 
 
 def _advance(problem: Problem, at: Progress, steps: int, differentiable: bool) -> Progress:
-    if isinstance(problem.loss, PairKernel) and _compiles(problem, problem.loss):
-        return _compiled(problem, problem.loss, at, steps)
+    look = _look(problem)
+    if look is not None:
+        return _walked(problem, look, at, steps)
     for _ in range(steps):
         at = step(problem, at, differentiable)
     return at
 
 
-def _compiles(problem: Problem, loss: PairKernel) -> bool:
-    """Whether the steps can be walked without a tensor in between."""
-    if not isinstance(loss.kernel, SoftKernel) or not isinstance(problem.chart, RotationVector):
-        return False
-    if problem.temperature.learned or problem.inner.keep != "last" or backend(loss.pair.P.device).name != "numba":
-        return False
-    scene = Scene(loss.pair, problem.unit, loss.rounding)
-    return sweeps_for(loss.kernel.terms, scene).name == "numba"
+def _look(problem: Problem) -> Callable[[CloudPair, Tensor], Scene] | None:
+    """What walks the steps without a tensor in between; None where nothing can."""
+    loss, inner = problem.loss, problem.inner
+    if not isinstance(loss, PairKernel) or loss.pair.P.device.type != "cpu":
+        return None
+    if problem.temperature.learned or inner.keep != "last" or not isinstance(problem.chart, RotationVector):
+        return None
+    if isinstance(loss.kernel, MatchedKernel):
+        return partial(MatchedScene, loss.kernel)
+    if isinstance(loss.kernel, SoftKernel):
+        terms = loss.kernel.terms
+        if sweeps_for(terms, kernel_scene.Scene(loss.pair, problem.unit, loss.rounding)).name == "numba":
+            from bbr_layer.inner.compiled_scene import CompiledScene  # only where it is used: Numba takes long to load
+
+            return partial(CompiledScene, terms)
+    return None
 
 
-def _compiled(problem: Problem, loss: PairKernel, at: Progress, steps: int) -> Progress:
-    from bbr_layer.inner.compiled import Steps, walk  # Numba takes a second to load: only where it is used
-
-    inner, done, d = problem.inner, at.moments.step, at.state.translation.shape[-1]
-    blocks = rotation_dimensions(d), d
+def _walked(problem: Problem, look: Callable[[CloudPair, Tensor], Scene], at: Progress, steps: int) -> Progress:
+    loss, inner, done, d = problem.loss, problem.inner, at.moments.step, at.state.translation.shape[-1]
+    assert isinstance(loss, PairKernel)
     shares = [share_done(number, inner.steps) for number in range(done, done + steps)]
     lowest = floor(problem)
     temperatures = torch.stack([torch.maximum(problem.temperature.at(x, problem.unit), lowest) for x in shares])
+    blocks = rotation_dimensions(d), d
     rates = torch.stack([inner.rates(blocks, at.moments.first, number) for number in range(done, done + steps)])
-    assert isinstance(loss.kernel, SoftKernel)
     begun = (*at.state, at.moments.first, at.moments.second)
-    end = walk(Steps(loss.kernel.terms, inner, done), (loss.pair, loss.rounding), begun, temperatures, rates)
+    end = walk(Steps(look, inner, done), (loss.pair, loss.rounding), begun, temperatures, rates)
     moments = Moments(end.first, end.second, done + steps)
     state = State(end.rotation, end.translation)
     return at._replace(state=state, temperature=temperatures[-1], moments=moments, gradient_norm=end.gradient_norm)

@@ -1,21 +1,33 @@
-"""Many steps of the unroll as one node of the graph, by compiled sweeps.
+"""Many steps of the unroll as one node of the graph.
 
 The clouds are packed once, and nothing between the steps is a tensor. Backward walks the steps in reverse; each asks
 for one directional derivative of the loss's gradient.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bbr_layer.inner.adam import Adam
-from bbr_layer.inner.adam_by_hand import HandAdam, Point, Taken
-from bbr_layer.inner.compiled_scene import CompiledScene
+from bbr_layer.inner.adam_by_hand import HandAdam, Point, Taken, Totals
 from bbr_layer.inner.once import once
-from bbr_layer.kernels.scene import SoftTerms
 from bbr_layer.pair import CloudPair
+
+
+@runtime_checkable
+class Scene(Protocol):
+    """A pair of clouds under one loss, looked at from one pose after the other; see ``CompiledScene``."""
+
+    def totals(self) -> Totals: ...
+
+    def slope(self, at: Point, temperature: np.ndarray) -> np.ndarray: ...
+
+    def pull_back(
+        self, at: Point, temperature: np.ndarray, along: np.ndarray, totals: Totals
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
 
 
 class Steps(NamedTuple):
@@ -23,12 +35,12 @@ class Steps(NamedTuple):
 
     Parameters
     ----------
-    terms: the loss.
+    look: makes the loss's scene from the pair and the rounding ``(batch,)``.
     inner: the optimiser.
     done: steps of this stage taken before.
     """
 
-    terms: SoftTerms
+    look: Callable[[CloudPair, Tensor], Scene]
     inner: Adam
     done: int
 
@@ -64,7 +76,7 @@ class _Walk(torch.autograd.Function):
     def forward(ctx: Any, steps: Steps, *given: Any) -> tuple[Tensor, ...]:
         rounding, temperatures, rates, rotation, translation, first, second, *fields = given
         pair, d = CloudPair._make(fields), translation.shape[-1]
-        scene, adam = CompiledScene(steps.terms, pair, rounding), HandAdam(steps.inner, d)
+        scene, adam = steps.look(pair, rounding), HandAdam(steps.inner, d)
         at = Point(_embedded(rotation, 1.0), _padded(translation), first.numpy(), second.numpy())
         points, gradients = [at], []
         for number, (temperature, rate) in enumerate(zip(temperatures.numpy(), rates.numpy(), strict=True)):
@@ -90,7 +102,7 @@ class _Walk(torch.autograd.Function):
         """Cotangents of everything that is saved, in order."""
         rounding, temperatures, rates, rotation, translation, _, _, *fields = ctx.saved_tensors
         pair, d, steps = CloudPair._make(fields), translation.shape[-1], ctx.steps
-        scene, adam = CompiledScene(steps.terms, pair, rounding), HandAdam(steps.inner, d)
+        scene, adam = steps.look(pair, rounding), HandAdam(steps.inner, d)
         totals, heats, speeds = scene.totals(), np.zeros(temperatures.shape), np.zeros(rates.shape)
         back = Point(_embedded(cotangents[0], 0.0), _padded(cotangents[1]), *(x.numpy() for x in cotangents[2:4]))
         for number in reversed(range(len(heats))):
