@@ -85,6 +85,18 @@ def columns_by_count(table: Float[np.ndarray, "n c"]) -> Columns:
     return Columns(points, intensity=table[:, 3] if count in (4, 5) else None)
 
 
+def real_numbers(values: np.ndarray) -> np.ndarray:
+    """The array as float64.
+
+    Raises
+    ------
+    ValueError: it holds complex numbers or no numbers.
+    """
+    if np.iscomplexobj(values):
+        raise ValueError(f"it holds {values.dtype} numbers; coordinates are real")
+    return values.astype(np.float64)
+
+
 def are_unit(vectors: Float[np.ndarray, "n 3"]) -> bool:
     """Do these rows look like normals: of length 1, except for missing ones (zeros, NaN)?"""
     length = lengths(vectors)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bbr_layer.cloud_columns import Columns, are_unit, chosen_names, columns_by_count, columns_by_name
+from bbr_layer.cloud_columns import Columns, are_unit, chosen_names, columns_by_count, columns_by_name, real_numbers
 
 BIN_BYTES = 4  # float32, the KITTI velodyne layout
 POINT_KEYS = ("points", "P", "xyz")  # what an .npz calls its points, the first one found
@@ -30,7 +30,7 @@ def read_bin(path: Path) -> Columns:
 
 def read_npy(path: Path) -> Columns:
     """One array of rows, see ``columns_by_count``."""
-    return columns_by_count(np.load(path, allow_pickle=False))
+    return columns_by_count(real_numbers(np.load(path, allow_pickle=False)))
 
 
 def read_npz(path: Path) -> Columns:
@@ -45,14 +45,36 @@ def read_npz(path: Path) -> Columns:
         if key is None:
             raise ValueError(f"it holds {', '.join(arrays.files)}; an array named points, P or xyz is wanted")
         if "offsets" in arrays.files:
-            raise ValueError(f"it holds {len(arrays['offsets']) - 1} scans, not one; read_scans reads them")
-        columns = columns_by_count(arrays[key])
-        given = {name: arrays[name].astype(np.float64) for name in ("normals", "intensity") if name in arrays.files}
+            count = max(arrays["offsets"].size - 1, 0)
+            raise ValueError(f"it holds {count} scans, not one; read_scans reads them")
+        columns = columns_by_count(real_numbers(arrays[key]))
+        given = {name: real_numbers(arrays[name]) for name in ("normals", "intensity") if name in arrays.files}
     shapes = {"normals": columns.points.shape, "intensity": columns.points.shape[:1]}
     for name, values in given.items():
         if values.shape != shapes[name]:
             raise ValueError(f"its {name} have shape {values.shape} and its points {columns.points.shape}")
     return columns._replace(**given)
+
+
+def read_npz_sequence(path: Path) -> list[Columns]:
+    """Several scans: ``points (n, 2 or 3)`` cut at ``offsets``, which rise from 0 to n.
+
+    Raises
+    ------
+    ValueError: the arrays are not those.
+    """
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        if missing := {"points", "offsets"} - set(arrays.files):
+            raise ValueError(f"it holds {', '.join(arrays.files)} and lacks {' and '.join(sorted(missing))}")
+        points, offsets = arrays["points"], arrays["offsets"]
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"its points have shape {points.shape}; rows of x y or x y z are wanted")
+    if offsets.ndim != 1 or len(offsets) < 2 or not np.issubdtype(offsets.dtype, np.integer):
+        raise ValueError(f"its offsets are {offsets.dtype} of shape {offsets.shape}; a row of integers is wanted")
+    if offsets[0] != 0 or offsets[-1] != len(points) or (offsets[1:] < offsets[:-1]).any():
+        raise ValueError(f"its offsets do not rise from 0 to the number of points, {len(points)}")
+    pairs = zip(offsets[:-1], offsets[1:], strict=True)
+    return [Columns(real_numbers(points[begin:end])) for begin, end in pairs]
 
 
 def read_text(path: Path) -> Columns:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from bbr_layer.atomic import existing_file
 from bbr_layer.cloud_columns import Columns, lengths
 from bbr_layer.cloud_formats import read_las, read_mesh, read_pcd, read_ply
-from bbr_layer.cloud_tables import read_bin, read_npy, read_npz, read_text
+from bbr_layer.cloud_tables import read_bin, read_npy, read_npz, read_npz_sequence, read_text
 
 # Formats made for points and meshes; a folder that holds any of them is read by them alone.
 CLOUD_READERS: dict[str, Callable[[Path], Columns]] = {
@@ -159,14 +159,10 @@ def read_scans(source: str | Path | Sequence[str | Path]) -> list[Cloud]:
 
 def _read_sequence(path: Path) -> list[Cloud]:
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            points, offsets = arrays["points"].astype(np.float64), arrays["offsets"]
+        parts = read_npz_sequence(path)
     except UNREADABLE as error:
         raise ValueError(f"{path} is no .npz of several scans, with points and offsets: {_reason(error)}") from error
-    if offsets[0] != 0 or offsets[-1] != len(points) or (np.diff(offsets) < 0).any():
-        raise ValueError(f"{path} has offsets that do not rise from 0 to the number of points, {len(points)}")
-    parts = np.split(points, offsets[1:-1])
-    return [_finite_cloud(f"{path}, scan {i}", Columns(part)) for i, part in enumerate(parts)]
+    return [_finite_cloud(f"{path}, scan {i}", part) for i, part in enumerate(parts)]
 
 
 def _finite_cloud(name: str | Path, columns: Columns) -> Cloud:

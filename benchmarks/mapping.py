@@ -3,66 +3,88 @@
     python -m benchmarks.mapping sequences --out benchmarks/mapping_sequences.md
     python -m benchmarks.mapping terms --out benchmarks/mapping_terms.md
 
-``sequences`` maps DeepMapping's v1_pose0, KITTI 00 and BALM as the main job does, and reports the error of the
-edges' map and of the trained one. ``terms`` starts v1_pose0 (every 4th scan) from its true poses shaken by 5 px and
-2 degrees, and trains it with every term, same seed and same epochs.
+``sequences`` writes DeepMapping's v1_pose0 (PCD), KITTI 00 and BALM (PLY) as folders of scans beside a file of their
+true poses, maps each folder as ``python -m train map`` does, and reports the error of the edges' map and of the
+trained one; the truth is read for that alone. Scans, maps and pictures stay in ``out/benchmark``. ``terms`` starts
+v1_pose0 (every 4th scan) from its true poses shaken by 5 px and 2 degrees, and trains it with every term, same seed
+and same epochs.
 """
 
 import argparse
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from bbr_layer import RigidMotion
+from bbr_layer import RigidMotion, write_cloud, write_poses_tum
 from benchmarks.data import data_folder
 from train.config import TERMS, EdgeConfig, MapConfig, TrainingConfig
+from train.console import PrintedUnit
 from train.edges import register_edges
 from train.evaluate import evaluate_trajectory
+from train.mapping import map_scans
 from train.poses import embed_poses
-from train.scans import ScanSet
+from train.run_folder import open_run
+from train.scans import ScanSet, read_scan_set
 from train.training import train_map
 
-# File, dimension, unit per length, name of the unit.
+
+class Sequence(NamedTuple):
+    """A file of scans, the format they are written in, and the unit of the errors in the table."""
+
+    file: str
+    suffix: str
+    unit: PrintedUnit
+
+
 SEQUENCES = {
-    "v1_pose0, every scan": ("seq_deepmapping2d_v1_pose0", 2, 512.0, "px"),
-    "kitti00 0-15": ("seq_kitti00_0-15", 3, 1.0, "m"),
-    "balm 30-108": ("seq_balm_realworld_30-108", 3, 1.0, "m"),
+    "v1_pose0, every scan": Sequence("seq_deepmapping2d_v1_pose0", ".pcd", PrintedUnit(512.0, "px")),
+    "kitti00 0-15": Sequence("seq_kitti00_0-15", ".ply", PrintedUnit(1.0, "m")),
+    "balm 30-108": Sequence("seq_balm_realworld_30-108", ".ply", PrintedUnit(1.0, "m")),
 }
+WORK = Path("out", "benchmark")
 SHAKEN_PX, SHAKEN_DEG = 5.0, 2.0
-TERM_EPOCHS = 20
+# Enough for L-Net to move scans by several point spacings, its unit of length.
+TERM_EPOCHS, TERM_RATE = 60, 1e-2
 
 
-def sequence(file: str, dimension: int, stride: int = 1) -> ScanSet:
-    """One sequence with its truth, in the first scan's frame."""
-    held = np.load(data_folder() / f"{file}.npz")
-    bounds, poses = held["offsets"], held["poses"]
-    scans = [held["points"][a:b, :dimension].astype(float) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    if dimension == 2:
-        poses = poses[:, [0, 1, 3]][:, :, [0, 1, 3]]
-    truth = (np.linalg.inv(poses[0]) @ poses)[::stride]
-    kept = scans[::stride]
-    return ScanSet(kept, [str(i) for i in range(len(kept))], np.arange(len(kept), dtype=float), None, truth)
+def as_folder(chosen: Sequence, work: Path, stride: int = 1) -> tuple[Path, Path]:
+    """Scans written as files of a folder, each in its sensor's frame, and their true poses as a file beside it."""
+    held = np.load(data_folder() / f"{chosen.file}.npz", allow_pickle=False)
+    scans, truth = work / "scans", work / "truth_tum.txt"
+    scans.mkdir(parents=True, exist_ok=True)
+    bounds, poses = held["offsets"], held["poses"].astype(float)
+    for number in range(0, len(poses), stride):
+        points = held["points"][bounds[number] : bounds[number + 1]]
+        write_cloud(scans / f"{number:04d}{chosen.suffix}", points)
+    kept = (np.linalg.inv(poses[0]) @ poses)[::stride]
+    write_poses_tum(truth, kept, np.arange(len(kept), dtype=float))
+    return scans, truth
 
 
 def ape(poses: RigidMotion, scans: ScanSet) -> float:
     """RMSE of the positions after rigid alignment, in the data's unit."""
-    return evaluate_trajectory(embed_poses(poses.matrix.numpy()), embed_poses(scans.truth))["ape_rmse"]
+    return evaluate_trajectory(embed_poses(poses.matrix.numpy()), scans.truth)["ape_rmse"]
 
 
-def sequences(names: list[str]) -> list[str]:
-    """Rows of the table of sequences."""
-    rows = ["| sequence | scans | edges' map | trained | kept epoch | wall seconds |", "|---|---|---|---|---|---|"]
+def sequences(names: list[str]) -> Iterator[str]:
+    """Rows of the table of sequences, each when it is measured."""
+    yield from ("| sequence | scans | edges' map | trained | kept epoch | wall seconds |", "|---|---|---|---|---|---|")
     for name in names:
-        file, dimension, unit, word = SEQUENCES[name]
-        scans, config, begin = sequence(file, dimension), MapConfig(), time.perf_counter()
-        edges, start = register_edges(scans, config.edges)
-        trained = train_map(scans, edges, start, config)
-        errors = " | ".join(f"{ape(x, scans) * unit:.4f} {word}" for x in (start, trained.world_from_scan))
-        rows.append(f"| {name} | {len(scans)} | {errors} | {trained.kept_epoch} | {time.perf_counter() - begin:.0f} |")
-        print(rows[-1], flush=True)
-    return rows
+        chosen, config = SEQUENCES[name], MapConfig()
+        work = WORK / chosen.file
+        folder, truth = as_folder(chosen, work)
+        begin = time.perf_counter()
+        scans = read_scan_set([folder], truth=truth)
+        run = open_run(work / "map", scans, config, overwrite=True)
+        mapped = map_scans(run, scans, config, unit=chosen.unit.of_files)
+        seconds = time.perf_counter() - begin
+        poses = (mapped.start, RigidMotion.from_matrix(torch.from_numpy(mapped.result.world_from_scan)))
+        errors = " | ".join(chosen.unit.length(ape(x, scans)) for x in poses)
+        yield f"| {name} | {len(scans)} | {errors} | {mapped.kept_epoch} | {seconds:.0f} |"
 
 
 def shaken(scans: ScanSet, seed: int = 0) -> RigidMotion:
@@ -76,25 +98,20 @@ def shaken(scans: ScanSet, seed: int = 0) -> RigidMotion:
     return RigidMotion(noise.rotation @ truth.rotation, truth.translation + noise.translation)
 
 
-def terms(names: list[str]) -> list[str]:
-    """Rows of the table of terms."""
-    scans = sequence("seq_deepmapping2d_v1_pose0", 2, stride=4)
+def terms(names: list[str]) -> Iterator[str]:
+    """Rows of the table of terms, each when it is measured."""
+    folder, truth = as_folder(SEQUENCES["v1_pose0, every scan"], WORK / "terms", stride=4)
+    scans = read_scan_set([folder], truth=truth)
     edges, _ = register_edges(scans, EdgeConfig())
     start = shaken(scans)
-    rows = [
-        f"The start is {ape(start, scans) * 512:.2f} px off; the edges of `residual` were registered from the scans.",
-        "",
-        "| term | px after training | kept epoch | wall seconds |",
-        "|---|---|---|---|",
-    ]
+    yield f"The start is {ape(start, scans) * 512:.2f} px off; the edges of `residual` were registered from the scans."
+    yield from ("", "| term | px after training | kept epoch | wall seconds |", "|---|---|---|---|")
     for name in names:
-        training = TrainingConfig(term=name, epochs=TERM_EPOCHS, localisation_rate=3e-3)
+        training = TrainingConfig(term=name, epochs=TERM_EPOCHS, localisation_rate=TERM_RATE)
         begin = time.perf_counter()
         trained = train_map(scans, edges, start, MapConfig(training=training))
         error = ape(trained.world_from_scan, scans) * 512
-        rows.append(f"| {name} | {error:.2f} | {trained.kept_epoch} | {time.perf_counter() - begin:.0f} |")
-        print(rows[-1], flush=True)
-    return rows
+        yield f"| {name} | {error:.2f} | {trained.kept_epoch} | {time.perf_counter() - begin:.0f} |"
 
 
 def main() -> None:
@@ -108,8 +125,13 @@ def main() -> None:
         rows = sequences(options.only or list(SEQUENCES))
     else:
         rows = terms(options.only or list(TERMS))
-    head = f"Made by `python -m benchmarks.mapping {options.table}` on {torch.get_num_threads()} threads."
-    options.out.write_text("\n".join([head, "", *rows]) + "\n")
+    threads = torch.get_num_threads()
+    head = f"Made by `python -m benchmarks.mapping {options.table}` on {threads} thread{'s' * (threads > 1)}."
+    lines = [head, ""]
+    for row in rows:
+        print(row, flush=True)
+        lines.append(row)
+        options.out.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

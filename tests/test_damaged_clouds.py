@@ -63,6 +63,7 @@ def test_a_header_that_promises_more_than_memory_holds(tmp_path):
 def test_what_is_no_cloud_file(tmp_path, points):
     (tmp_path / "a.jpeg").write_bytes(b"1")
     np.savez(tmp_path / "a.npz", src=points, tgt=points)
+    np.save(tmp_path / "complex.npy", points.astype(complex))
     (tmp_path / "b.csv").write_text("t,u,v\n1,2,3\n")
     (tmp_path / "nan.xyz").write_text("nan nan nan\nnan 1 2\n")
     for name, error, words in (
@@ -70,6 +71,7 @@ def test_what_is_no_cloud_file(tmp_path, points):
         (".", ValueError, "is a folder"),
         ("a.jpeg", ValueError, r"suffix '.jpeg'; readable are .ply"),
         ("a.npz", ValueError, "src, tgt; an array named points"),
+        ("complex.npy", ValueError, "complex128 numbers; coordinates are real"),
         ("b.csv", ValueError, "neither numbers nor a header"),
         ("nan.xyz", ValueError, r"no finite point \(2 in all\)"),
     ):
@@ -78,9 +80,23 @@ def test_what_is_no_cloud_file(tmp_path, points):
 
 
 def test_sequences_with_wrong_offsets(tmp_path, points):
-    np.savez(tmp_path / "a.npz", points=points, offsets=np.array([0, 20, 41]))
-    with pytest.raises(ValueError, match="rise from 0 to the number of points, 40"):
-        read_scans(tmp_path / "a.npz")
+    ends = "rise from 0 to the number of points, 40"
+    for offsets, words in (
+        (np.array([0, 20, 41]), ends),
+        (np.array([0, 30, 20, 40]), ends),
+        (np.array([0, 20, 40], dtype=np.uint8)[::-1], ends),
+        (np.array([0.0, 20.5, 40.0]), "float64 of shape"),
+        (np.array(0), r"int64 of shape \(\)"),
+        (np.array([], dtype=int), r"int64 of shape \(0,\)"),
+        (np.zeros((2, 2), dtype=int), r"int64 of shape \(2, 2\)"),
+    ):
+        np.savez(tmp_path / "a.npz", points=points, offsets=offsets)
+        with pytest.raises(ValueError, match=words):
+            read_scans(tmp_path / "a.npz")
+    for wrong, words in ((points[:, 0], r"shape \(40,\)"), (points.astype(complex), "coordinates are real")):
+        np.savez(tmp_path / "a.npz", points=wrong, offsets=np.array([0, 20, 40]))
+        with pytest.raises(ValueError, match=words):
+            read_scans(tmp_path / "a.npz")
     np.savez(tmp_path / "a.npz", points=points)
     with pytest.raises(ValueError, match="no .npz of several scans"):
         read_scans(tmp_path / "a.npz")

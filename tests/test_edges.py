@@ -105,6 +105,14 @@ def test_scans_of_a_room_are_mapped_without_any_starting_pose():
     assert reports[0][0] == "consecutive scans" and reports[-1][1] == reports[-1][2]
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_few_scans_are_enough(count):
+    scans = _room(count)
+    edges, poses = register_edges(scans, EdgeConfig(points=180))
+    assert len(edges.kind) == count * (count - 1) // 2
+    assert np.abs(poses.matrix.numpy() - scans.truth).max() < 0.02
+
+
 def test_scans_are_thinned_evenly_and_padded():
     scans = _room(3)
     shorter = ScanSet([scans.points[0][:40], *scans.points[1:]], scans.names, scans.timestamps)

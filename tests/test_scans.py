@@ -38,7 +38,7 @@ def test_a_folder_is_read_in_natural_order_and_planar(folder):
 
 
 def test_one_point_off_the_plane_makes_all_scans_3d(folder):
-    write_cloud(folder / "scan5.ply", np.array([[1.0, 1.0, 0.5], [1.0, 2.0, 0.0]]))
+    write_cloud(folder / "scan5.ply", np.array([[1.0, 1.0, 0.5], [1.0, 2.0, 0.0], [2.0, 1.0, 0.0]]))
     assert read_scan_set([folder]).dimension == 3
 
 
@@ -101,8 +101,10 @@ def test_one_scan_is_no_map(folder):
     [
         ({"names": ["a"]}, "2 scans came with 1 names"),
         ({"points": [np.zeros((3, 2)), np.zeros((3, 3))]}, "scan b has shape (3, 3)"),
-        ({"points": [np.ones((3, 2)), np.zeros((0, 2))]}, "scan b is empty"),
-        ({"points": [np.full((3, 2), np.nan), np.ones((3, 2))]}, "scan a is empty or not finite"),
+        ({"points": [np.ones((3, 2)), np.zeros((0, 2))]}, "scan b has 0 points"),
+        ({"points": [np.full((3, 2), np.nan), np.ones((3, 2))]}, "scan a is not finite"),
+        ({"points": [np.ones((1, 2)), np.ones((3, 2))]}, "scan a has 1 points; in 2D at least 2 are needed"),
+        ({"points": [np.ones((4, 3)), np.ones((2, 3))]}, "scan b has 2 points; in 3D at least 3 are needed"),
         ({"truth": np.tile(np.eye(4), (2, 1, 1))}, "truth has shape (2, 4, 4)"),
         ({"start": np.tile(np.eye(3), (3, 1, 1))}, "start has shape (3, 3, 3)"),
     ],

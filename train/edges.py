@@ -43,7 +43,8 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
     edges = _consecutive(prepared, scans, progress)
     poses = chained(edges, len(scans))
     poses = _anchored(poses, scans)
-    edges = edges.joined(_window(prepared, poses, config.window, progress))
+    if (steps := min(config.window, len(scans) - 1)) > 1:
+        edges = edges.joined(_window(prepared, poses, steps, progress))
     poses, weights = solve_pose_graph(edges, poses)
     for _ in range(config.rounds if config.loops_per_scan else 0):
         loops = _loops(prepared, poses, edges, config, progress)

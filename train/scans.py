@@ -26,7 +26,7 @@ class ScanSet:
 
     Parameters
     ----------
-    points: k arrays ``(n_i, d)`` float64 in the data's unit, d = 2 or 3, none of them empty.
+    points: k arrays ``(n_i, d)`` float64 in the data's unit, d = 2 or 3, each with at least d points.
     names: k names, for messages.
     timestamps: ``(k,)`` seconds, or the number of the scan.
     start: ``world_from_scan`` given by the user, ``(k, d + 1, d + 1)``; None: not known.
@@ -34,7 +34,8 @@ class ScanSet:
 
     Raises
     ------
-    ValueError: fewer than 2 scans, mixed dimensions, an empty scan, NaN, or numbers that do not fit together.
+    ValueError: fewer than 2 scans, mixed dimensions, a scan of fewer than d points, NaN, or numbers that do not fit
+        together.
     """
 
     points: list[Float[np.ndarray, "_ d"]]
@@ -52,8 +53,11 @@ class ScanSet:
         for name, scan in zip(self.names, self.points, strict=True):
             if scan.ndim != 2 or scan.shape[1] != self.dimension or scan.shape[1] not in (2, 3):
                 raise ValueError(f"scan {name} has shape {scan.shape}; all scans must be (n, 2), or all (n, 3)")
-            if not len(scan) or not np.isfinite(scan).all():
-                raise ValueError(f"scan {name} is empty or not finite; leave it out")
+            if not np.isfinite(scan).all():
+                raise ValueError(f"scan {name} is not finite; leave it out")
+            if len(scan) < self.dimension:
+                needed = f"in {self.dimension}D at least {self.dimension} are needed"
+                raise ValueError(f"scan {name} has {len(scan)} points; {needed}: leave it out")
         side = self.dimension + 1
         for role, poses in (("start", self.start), ("truth", self.truth)):
             if poses is not None and poses.shape != (k, side, side):
