@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bbr_layer.distances import smooth_root
-from bbr_layer.neighbours import nearest_neighbours
+from bbr_layer.neighbours import nearest_neighbours, neighbours_of
 
 # Neighbours (the point itself included) of the plane fit when normals are not given. Measured: 8 of the sparse
 # cloud's own points beat 13 (the paper's number, meant for the full cloud) on the bunny at 500 to 1000 points.
@@ -14,6 +14,9 @@ NORMAL_NEIGHBOURS = 8
 EIGENVALUE_GAP = 1e-6
 # Nearest neighbours searched for one that is not a duplicate of the point itself.
 SPACING_NEIGHBOURS = 4
+# Points of a cloud, evenly over its order, whose spacing is measured (against the whole cloud): the median of 4096
+# differs from that of a lidar scan's 120 000 by 1 percent.
+SPACING_POINTS = 4096
 
 
 def estimate_normals(
@@ -93,13 +96,22 @@ def point_spacing(
     """
     batch, (n, d) = points.shape[:-2], points.shape[-2:]
     flat = points.reshape(-1, n, d)
-    real = None if mask is None else mask.reshape(-1, n)
-    index = nearest_neighbours(flat, SPACING_NEIGHBOURS + 1, real)[..., 1:]
-    flat = flat.double()
-    squared = (torch.take_along_dim(flat[:, None], index[..., None], dim=2) - flat[:, :, None]).square().sum(-1)
+    real = [None] * len(flat) if mask is None else list(mask.reshape(-1, n))
+    items = [_item_spacing(item if kept is None else item[kept]) for item, kept in zip(flat, real, strict=True)]
+    return torch.stack(items).reshape(batch) if items else points.new_zeros(batch, dtype=torch.float64)
+
+
+def _item_spacing(points: Float[Tensor, "n d"]) -> Float[Tensor, ""]:
+    """``point_spacing`` of one cloud without padding."""
+    n, asked = len(points), min(len(points), SPACING_POINTS)
+    if not n:
+        return points.new_zeros((), dtype=torch.float64)
+    some = points[torch.arange(asked, device=points.device) * n // asked]
+    index = neighbours_of(some, points, SPACING_NEIGHBOURS + 1)[..., 1:]
+    squared = (points[index].double() - some[:, None].double()).square().sum(-1)
     distinct = squared.detach() > 0
     first = distinct.to(torch.int8).argmax(-1, keepdim=True)  # the nearest neighbour that is not a duplicate
-    usable = distinct.any(-1) if real is None else distinct.any(-1) & real
+    usable = distinct.any(-1)
     distance = smooth_root(squared.gather(-1, first)[..., 0])
-    median = torch.where(usable, distance, torch.nan).nanmedian(-1).values
-    return torch.where(usable.any(-1), median, 0.0).reshape(batch)
+    median = torch.where(usable, distance, torch.nan).nanmedian()
+    return torch.where(usable.any(), median, 0.0)

@@ -15,7 +15,8 @@ ORDER = {
         checks
         rotations
         geometry
-        pair
+        pair trees
+        margins
         neighbours distances
         normals buddies temperature
         kernels

@@ -1,0 +1,164 @@
+"""A forward-only registration of two full lidar scans by BBR-F, nothing thinned: where the seconds go.
+
+    python -m benchmarks.lidar --repeats 3 --out benchmarks/lidar.md
+
+Normals are estimated before the registration, and timed apart. The search alone is driven with the motions that the
+registration took, with margins and without.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals
+from bbr_layer.neighbours import MutualNeighbours
+from bbr_layer.normals import point_spacing
+from benchmarks.data import data_folder
+
+PAIR = "pair_kitti00_95_94"
+STEPS = 100
+RATES = (0.02, 0.005)  # F's default, and one that starts as near as these two scans do
+KIB_PER_MIB = 1024
+
+
+class Scans(NamedTuple):
+    """Two scans with their normals, batch of one, float32."""
+
+    P: Tensor
+    Q: Tensor
+    P_normals: Tensor
+    Q_normals: Tensor
+
+    def every(self, stride: int) -> "Scans":
+        """The same, thinned."""
+        return Scans(*(x[:, ::stride] for x in self))
+
+
+def best(work: Callable[[], object], repeats: int) -> float:
+    """Least seconds of processor time of several runs."""
+    seconds = []
+    for _ in range(repeats):
+        before = time.process_time()
+        work()
+        seconds.append(time.process_time() - before)
+    return min(seconds)
+
+
+def peak_memory(work: Callable[[], object]) -> float:
+    """MiB of resident memory at the peak above those at the beginning; Linux only."""
+    Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
+    before = resident("VmRSS")
+    work()
+    return (resident("VmHWM") - before) / KIB_PER_MIB
+
+
+def resident(name: str) -> int:
+    """One line of the process's status, KiB."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name))
+
+
+def register(scans: Scans, rate: float) -> None:
+    """The registration that is measured."""
+    layer = BBRLayer("F", inner=Adam(STEPS, rate), backward=Detached())
+    layer(scans.P, scans.Q, P_normals=scans.P_normals, Q_normals=scans.Q_normals)
+
+
+def recorded(scans: Scans, rate: float) -> tuple[Tensor, Tensor, list[RigidMotion]]:
+    """Target, source and motions of the search that the registration's steps asked."""
+    searches: dict[MutualNeighbours, list[RigidMotion]] = {}
+    begin, answer = MutualNeighbours.__init__, MutualNeighbours.__call__
+    clouds: dict[MutualNeighbours, tuple[Tensor, Tensor]] = {}
+
+    def spied_begin(self: MutualNeighbours, P: Tensor, Q: Tensor, *rest: Tensor | None) -> None:
+        clouds[self] = P, Q
+        begin(self, P, Q, *rest)
+
+    def spied_answer(self: MutualNeighbours, motion: RigidMotion) -> tuple[Tensor, Tensor]:
+        searches.setdefault(self, []).append(motion.detach())
+        return answer(self, motion)
+
+    with (
+        patch.object(MutualNeighbours, "__init__", spied_begin),
+        patch.object(MutualNeighbours, "__call__", spied_answer),
+    ):
+        register(scans, rate)
+    longest = max(searches, key=lambda search: len(searches[search]))
+    return *clouds[longest], searches[longest]
+
+
+def search_row(scans: Scans, rate: float, repeats: int) -> str:
+    """One table row: the registration, and its search with and without margins."""
+    P, Q, motions = recorded(scans, rate)
+    built = best(lambda: MutualNeighbours(P, Q), repeats)
+    seconds, searches = {}, {}
+    for margins in (True, False):
+
+        def drive(margins: bool = margins) -> None:
+            searches[margins] = MutualNeighbours(P, Q, margins=margins)
+            for motion in motions:
+                searches[margins](motion)
+
+        seconds[margins] = best(drive, repeats)
+    whole = best(lambda: register(scans, rate), repeats)
+    kept = searches[True]
+    cells = (
+        f"{rate:g}",
+        f"{whole:.1f}",
+        f"{built:.2f}",
+        f"{seconds[True]:.1f}",
+        f"{seconds[False]:.1f}",
+        f"{kept.asked / 1e6:.1f} M",
+        f"{1 - kept.looked_up / kept.asked:.0%}",
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+def processor() -> str:
+    """The machine's processor by name."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def main() -> None:
+    """Write the tables to the file named."""
+    parser = argparse.ArgumentParser(description="full lidar scans")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/lidar.md"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    arrays = np.load(data_folder() / f"{PAIR}.npz")
+    P, Q = (torch.from_numpy(arrays[name])[None] for name in ("tgt", "src"))
+    normals = best(lambda: (estimate_normals(P), estimate_normals(Q)), options.repeats)
+    spacing = best(lambda: (point_spacing(P), point_spacing(Q)), options.repeats)
+    scans = Scans(P, Q, estimate_normals(P), estimate_normals(Q))
+    lines = [
+        f"Made by `python -m benchmarks.lidar --repeats {options.repeats}` on one thread of {processor()}: {PAIR}, "
+        f"{P.shape[1]} and {Q.shape[1]} points, nothing thinned, BBR-F, {STEPS} Adam steps, forward only. Seconds are "
+        "the least processor time of the repeats. Normals are given.",
+        "",
+        "| rate | registration, s | building both trees, s | search with margins, s | without, s | neighbours wanted |"
+        " look-ups saved |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    register(scans.every(100), RATES[0])  # what is loaded once does not count
+    memory = peak_memory(lambda: register(scans, RATES[0]))
+    lines += [search_row(scans, rate, options.repeats) for rate in RATES]
+    lines += [
+        "",
+        f"Search times include building. Before the registration: normals of both scans {normals:.2f} s. Within it: "
+        f"spacing of both {spacing:.2f} s. Peak memory of the registration: {memory:.0f} MiB above what was held before.",
+    ]
+    print("\n".join(lines))
+    options.out.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
