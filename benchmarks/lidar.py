@@ -154,7 +154,7 @@ def main() -> None:
     lines += [
         "",
         f"Search times include building. Before the registration: normals of both scans {normals:.2f} s. Within it: "
-        f"spacing of both {spacing:.2f} s. Peak memory of the registration: {memory:.0f} MiB above what was held before.",
+        f"spacing of both {spacing:.2f} s. Peak memory of the registration: {memory:.0f} MiB above what was held.",
     ]
     print("\n".join(lines))
     options.out.write_text("\n".join(lines) + "\n")
