@@ -14,7 +14,7 @@ from hatchling.builders.wheel import WheelBuilder
 
 PROJECT = Path(__file__).resolve().parent.parent
 # Each package with the extras that its users install beside the runtime requirements.
-EXTRAS = {"bbr_layer": ["las"], "models": ["train"], "train": ["train"]}
+EXTRAS = {"bbr_layer": ["gpu", "las"], "models": ["train"], "train": ["train"]}
 
 
 def version() -> str:
