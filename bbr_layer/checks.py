@@ -5,6 +5,8 @@ from torch import Tensor
 
 # Fewest points that can say anything about a motion; a single one leaves every rotation open.
 FEWEST_POINTS = 2
+# How far R R^T may be from the identity: files hold 6 digits.
+ROTATION_TOLERANCE = 1e-3
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
@@ -54,6 +56,8 @@ def check_pair(P: Tensor, Q: Tensor) -> None:
     """Refuse clouds of different dimensions or batch shapes."""
     if P.shape[-1] != Q.shape[-1]:
         raise ValueError(f"P is {P.shape[-1]}D and Q {Q.shape[-1]}D: both clouds must have the same dimension")
+    if 0 in P.shape[:-2]:
+        raise ValueError(f"P has batch shape {tuple(P.shape[:-2])}; that is no pair at all: leave the call out")
     if P.shape[:-2] != Q.shape[:-2]:
         raise ValueError(
             f"P has batch shape {tuple(P.shape[:-2])} and Q {tuple(Q.shape[:-2])}; they must agree: expand one"
@@ -106,3 +110,13 @@ def check_mask(name: str, mask: Tensor | None, points: Tensor) -> None:
     if mask.dtype != torch.bool:
         raise ValueError(f"{name} has dtype {mask.dtype}; a mask is boolean, True where a point is real: {name}.bool()")
     check_companion(name, mask, points, trailing=False)
+
+
+def check_rotation(name: str, rotation: Tensor) -> None:
+    """Refuse matrices ``(*batch, d, d)`` that are not orthogonal, or that reflect."""
+    found = rotation.detach().double()
+    apart = (found @ found.mT - torch.eye(found.shape[-1], dtype=found.dtype, device=found.device)).abs().max()
+    if apart > ROTATION_TOLERANCE or (torch.linalg.det(found) < 0).any():
+        raise ValueError(
+            f"{name} is no rotation (R R^T is off the identity by {apart:.1g}, or it reflects): orthogonalise"
+        )

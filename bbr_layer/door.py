@@ -75,6 +75,7 @@ def checked_start(start: RigidMotion | None, pair: CloudPair, batch: tuple[int, 
     if start.translation.device != pair.P.device:
         raise ValueError(f"start is on {start.translation.device} and P on {pair.P.device}: try start.to(P.device)")
     checks.check_finite("start", start.matrix, None)
+    checks.check_rotation("start.rotation", start.rotation)
     rotation = _own(start.rotation).double().expand(*batch, d, d).reshape(-1, d, d)
     return RigidMotion(rotation, _own(start.translation).double().expand(*batch, d).reshape(-1, d))
 

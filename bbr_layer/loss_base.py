@@ -1,5 +1,6 @@
 """What the losses share: binding to a pair of clouds, rounding off at zero, weights, and soft matching."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -18,7 +19,7 @@ from bbr_layer.pair import CloudPair
 Objective = Callable[[RigidMotion, Tensor], Tensor]
 
 
-class Loss(nn.Module):
+class Loss(nn.Module, ABC):
     """What the four losses share: rounding off at zero, weights, and binding to one pair of clouds.
 
     Parameters
@@ -44,9 +45,9 @@ class Loss(nn.Module):
         """The loss as a function of the motion and the temperature, with ``pair.Q`` not yet moved."""
         return lambda motion, temperature: self(pair.moved_by(motion), temperature)
 
+    @abstractmethod
     def kernel(self, pair: CloudPair) -> Kernel:
         """The loss in closed form, for a pair whose source is not yet moved."""
-        raise NotImplementedError
 
     def temperature_unit(self, pair: CloudPair) -> Tensor:
         """Spacing that temperatures are multiples of, ``(batch,)``."""
@@ -85,9 +86,9 @@ class SoftLoss(Loss):
             pair.both_features()
         return SoftKernel(self.terms(match))
 
+    @abstractmethod
     def terms(self, match: str) -> SoftTerms:
         """What the kernels need to know; ``match`` is settled."""
-        raise NotImplementedError
 
     def extra_repr(self) -> str:
         features = f", match={self.match!r}, feature_weight={self.feature_weight}"

@@ -7,9 +7,6 @@ from bbr_layer.trees import Tree, squared_length
 
 # Computed lengths are off by a few 2^-53 of themselves; this share covers them many times over.
 ROUNDING = 1e-12
-# Share of doubtful neighbours above which their own distances are not computed. Measured on a lidar pair: the few
-# look-ups they would still save (6 percent) cost as much as they save.
-HOPELESS = 0.9
 
 
 class Margins:
@@ -43,7 +40,7 @@ class Margins:
     ) -> Int[np.ndarray, "m"]:
         """Index of the nearest point of the tree, right for the ``wanted`` ones of the moving points (None: all)."""
         asked = len(queries) if wanted is None else int(np.count_nonzero(wanted))
-        expired = self._expired(queries, wanted, asked)
+        expired = self._expired(queries, wanted)
         self.asked += asked
         self.looked_up += len(expired)
         if len(expired):
@@ -53,7 +50,7 @@ class Margins:
             self.free[expired] = np.square((second - first) * (0.5 - ROUNDING))
         return self.index
 
-    def _expired(self, queries: np.ndarray, wanted: np.ndarray | None, asked: int) -> Int[np.ndarray, "k"]:
+    def _expired(self, queries: np.ndarray, wanted: np.ndarray | None) -> Int[np.ndarray, "k"]:
         """The wanted rows whose neighbour may have changed since it was found."""
         if not self.kept:
             return np.arange(len(queries)) if wanted is None else np.flatnonzero(wanted)
@@ -61,8 +58,6 @@ class Margins:
         moved = np.einsum("md,md->m", offsets, offsets)
         doubtful = ~(moved < self.free)
         rows = np.flatnonzero(doubtful if wanted is None else doubtful & wanted)
-        if len(rows) > HOPELESS * asked:
-            return rows
         at, own = queries.take(rows, axis=0), self.tree.points.take(self.index[rows], axis=0)
         least = np.sqrt(squared_length(at - own)) + np.sqrt(moved[rows])
         return rows[~(least * (1 + ROUNDING) < self.second[rows])]

@@ -89,6 +89,7 @@ def squared_length(offsets: Float[np.ndarray, "*rows d"]) -> Float[np.ndarray, "
     return squared
 
 
-def in_space(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 3"]:
+def in_space(points: Float[np.ndarray, "*rows d"]) -> Float[np.ndarray, "*rows 3"]:
     """Points of the plane at height 0, which changes no distance; points of space as they are."""
-    return points if points.shape[1] == 3 else np.pad(points, ((0, 0), (0, 1)))
+    missing = 3 - points.shape[-1]
+    return np.pad(points, ((0, 0),) * (points.ndim - 1) + ((0, missing),)) if missing else points

@@ -1,5 +1,6 @@
 """What the mapper reads, a padded group of scans and the edges between them; and what a term is."""
 
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import torch
@@ -60,7 +61,7 @@ class ScanBatch(NamedTuple):
         return torch.where(self.mask[..., None], normals, 0.0)
 
 
-class RegistrationTerm(nn.Module):
+class RegistrationTerm(nn.Module, ABC):
     """How well neighbouring scans agree: one number in the data's unit of length, to be minimised.
 
     Every term is the mean over the edges of the batch, weighted by ``edge_weight``; 0 without edges. Being
@@ -70,6 +71,7 @@ class RegistrationTerm(nn.Module):
     def set_progress(self, fraction: float) -> None:
         """Tell the term that ``fraction`` in [0, 1] of the training is done; a term that anneals listens."""
 
+    @abstractmethod
     def forward(
         self,
         world_points: Float[Tensor, "g n d"],
@@ -79,7 +81,6 @@ class RegistrationTerm(nn.Module):
         batch: ScanBatch,
     ) -> Float[Tensor, ""]:
         """The term for scans at ``world_from_scan``; normals turned into the world, or None."""
-        raise NotImplementedError
 
 
 def edge_mean(values: Float[Tensor, "e"], weights: Float[Tensor, "e"]) -> Float[Tensor, ""]:

@@ -74,7 +74,12 @@ def test_shared_moments_have_no_special_axis():
 
 @pytest.mark.parametrize(
     ("settings", "sentence"),
-    [({"steps": 0}, "steps is 0"), ({"rate": -0.1}, "rate is -0.1"), ({"keep": "first"}, "keep is 'first'")],
+    [
+        ({"steps": 0}, "steps is 0"),
+        ({"steps": 1.5}, "steps is 1.5"),
+        ({"rate": -0.1}, "rate is -0.1"),
+        ({"keep": "first"}, "keep is 'first'"),
+    ],
 )
 def test_wrong_settings_are_refused(settings, sentence):
     with pytest.raises(ValueError, match=sentence):

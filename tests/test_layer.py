@@ -195,6 +195,7 @@ def test_a_plane_is_found_degenerate():
 
 
 P3, Q3 = torch.rand(8, 3), torch.rand(9, 3)
+EYE = torch.eye(3)
 WRONG = {
     "P has shape (3, 8); its last dimension must hold 2 or 3 coordinates: try P.mT": {"P": P3.mT},
     "Q has shape (3,); expected (*batch, points, 2 or 3)": {"Q": Q3[0]},
@@ -212,6 +213,9 @@ WRONG = {
     "P_mask has dtype torch.float32": {"P_mask": torch.ones(8)},
     "Q_features is missing": {"P_features": torch.ones(8, 2)},
     "P is a list": {"P": [[0.0, 0.0, 0.0]] * 4},
+    "P has batch shape (0,); that is no pair at all": {"P": P3.expand(0, 8, 3), "Q": Q3.expand(0, 9, 3)},
+    "start.rotation is no rotation (R R^T is off the identity by 3": {"start": RigidMotion(2 * EYE, torch.zeros(3))},
+    "start.rotation is no rotation": {"start": RigidMotion(-EYE, torch.zeros(3))},
     "start moves 2D points and the clouds are 3D": {"start": RigidMotion.identity(2)},
 }
 

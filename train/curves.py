@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 from scipy.spatial.transform import Rotation
 
 from train.drawing import (
@@ -106,6 +106,7 @@ def losses_picture(losses: Mapping[str, Sequence[float]]) -> Figure:
         usable = values[np.isfinite(values)]
         if len(usable) and usable.min() > 0 and usable.max() > LOG_FACTOR * usable.min():
             axes.set_yscale("log")
+            axes.yaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_title(name, fontsize=10, color=INK)
         axes.set_xlabel("epoch")

@@ -99,8 +99,8 @@ class Adam(nn.Module):
         keep: str = "last",
     ):
         super().__init__()
-        if steps < 1:
-            raise ValueError(f"steps is {steps}; the inner registration needs at least 1: try 60")
+        if not isinstance(steps, int) or steps < 1:
+            raise ValueError(f"steps is {steps}; the inner registration needs a whole number, at least 1: try 60")
         if keep not in ("last", "best"):
             raise ValueError(f"keep is {keep!r}; it must be 'last' or 'best'")
         for name, value in (

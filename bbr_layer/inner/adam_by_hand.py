@@ -8,6 +8,7 @@ are embedded in space, so that rotations are always ``(batch, 3, 3)``; ``axes`` 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bbr_layer.inner.adam import Adam
 from bbr_layer.rotations import rotation_dimensions
@@ -144,11 +145,8 @@ def axial(matrices: np.ndarray) -> np.ndarray:
 
 
 def exponential(vectors: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula, ``(batch, 3, 3)``; exact at 0 by the normalised sine."""
-    angle = np.sqrt((vectors**2).sum(axis=1))[:, None, None]
-    generator = hat(vectors)
-    sine, half = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi))
-    return np.eye(3) + sine * generator + 0.5 * half**2 * (generator @ generator)
+    """Rotations of rotation vectors ``(batch, 3)``, ``(batch, 3, 3)``."""
+    return Rotation.from_rotvec(vectors).as_matrix()
 
 
 def left_jacobian(vectors: np.ndarray) -> np.ndarray:

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from bbr_layer.inner.adam_by_hand import Point, Totals, axial, hat, transposed
 from bbr_layer.kernels.cpu import FAR, LONG_NORMAL, pack
-from bbr_layer.kernels.cpu_batch import COLUMN_OUT, DUAL, GRADIENT, ROW_OUT, Sums, run_sweeps
-from bbr_layer.kernels.cpu_math import COOL, VELOCITY
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Sums, run_sweeps
+from bbr_layer.kernels.cpu_math import COLUMN_OUT, COOL, HEAT, ROUND, ROW_OUT, VELOCITY
 from bbr_layer.kernels.scene import Scene, SoftTerms
 from bbr_layer.pair import CloudPair
 
@@ -67,7 +67,7 @@ class CompiledScene:
             rotation += torque @ transposed(self.normals)
             totals.Q_normals[:] += transposed(at.rotation) @ torque
         self._add(sums, totals)
-        heat = sums.rows[:, ROW_OUT + 6].sum(axis=1) / temperature**2
+        heat = sums.rows[:, ROW_OUT + HEAT].sum(axis=1) / temperature**2
         return rotation, self._unpadded(rates[:, :3]).sum(axis=2), heat
 
     def _place(self, at: Point, temperature: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
@@ -84,10 +84,10 @@ class CompiledScene:
 
     def _add(self, sums: Sums, totals: Totals) -> None:
         totals.P[:] += sums.rows[:, ROW_OUT : ROW_OUT + 3]
-        totals.P_normals[:] += sums.rows[:, ROW_OUT + 3 : ROW_OUT + 6]
+        totals.P_normals[:] += sums.rows[:, ROW_OUT + 3 : ROW_OUT + HEAT]
         totals.P_weights[:] += sums.row_shares[:, 1]
         totals.Q_weights[:] += sums.column_shares[:, 1]
-        totals.rounding[:] += self.rounding * sums.rows[:, ROW_OUT + 7].sum(axis=1)
+        totals.rounding[:] += self.rounding * sums.rows[:, ROW_OUT + ROUND].sum(axis=1)
 
     def _unpadded(self, vectors: np.ndarray) -> np.ndarray:
         """Float64, and 0 where padded."""

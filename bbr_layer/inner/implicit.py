@@ -13,8 +13,8 @@ from bbr_layer.rotations import rotation_dimensions
 # The Hessian counts as positive definite when its smallest eigenvalue is above this share of the largest: below it the
 # answer of a linear solve in float64 has no digits left.
 SINGULAR_SHARE = 1e-10
-# The result counts as optimal when a Newton step would move the cloud's rim by less than this share of a point
-# spacing; measured, the implicit gradient is then within a percent of the unrolled one.
+# The result counts as optimal when a Newton step would move the cloud's rim by less than this share of a point spacing:
+# the neighbourhoods that the soft buddies see are then the same. Chosen, not measured.
 SMALL_NEWTON_STEP = 1e-2
 
 

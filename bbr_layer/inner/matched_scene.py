@@ -10,6 +10,7 @@ from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam_by_hand import Point, Totals, axial, hat
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.pair import CloudPair
+from bbr_layer.trees import in_space
 
 
 class _Pairs(NamedTuple):
@@ -43,7 +44,9 @@ class MatchedScene:
     def __init__(self, kernel: MatchedKernel, pair: CloudPair, rounding: Tensor):
         self.search, self.d = kernel.search, pair.P.shape[-1]
         P_normals, Q_normals = pair.both_normals()
-        self.P, self.Q, self.P_normals, self.Q_normals = map(_in_space, (pair.P, pair.Q, P_normals, Q_normals))
+        self.P, self.Q, self.P_normals, self.Q_normals = (
+            in_space(vectors.detach().double().numpy()) for vectors in (pair.P, pair.Q, P_normals, Q_normals)
+        )
         self.P_weights, self.Q_weights = (
             np.ones(points.shape[:2]) if weights is None else weights.detach().double().numpy()
             for points, weights in ((self.P, pair.P_weights), (self.Q, pair.Q_weights))
@@ -114,9 +117,3 @@ class MatchedScene:
         return _Pairs(
             rows, columns, points, normals, arms, turned, offsets, planes, signs, residual, inverse, weights, shares
         )
-
-
-def _in_space(vectors: Tensor) -> np.ndarray:
-    """``(batch, n, 3)`` float64 of vectors of the plane or of space."""
-    values = vectors.detach().double().numpy()
-    return np.pad(values, ((0, 0), (0, 0), (0, 3 - values.shape[-1])))

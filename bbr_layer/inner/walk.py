@@ -15,6 +15,7 @@ from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.adam_by_hand import HandAdam, Point, Taken, Totals
 from bbr_layer.inner.once import once
 from bbr_layer.pair import CloudPair
+from bbr_layer.trees import in_space
 
 
 @runtime_checkable
@@ -77,7 +78,7 @@ class _Walk(torch.autograd.Function):
         rounding, temperatures, rates, rotation, translation, first, second, *fields = given
         pair, d = CloudPair._make(fields), translation.shape[-1]
         scene, adam = steps.look(pair, rounding), HandAdam(steps.inner, d)
-        at = Point(_embedded(rotation, 1.0), _padded(translation), first.numpy(), second.numpy())
+        at = Point(_embedded(rotation, 1.0), in_space(translation.numpy()), first.numpy(), second.numpy())
         points, gradients = [at], []
         for number, (temperature, rate) in enumerate(zip(temperatures.numpy(), rates.numpy(), strict=True)):
             gradient = scene.slope(at, temperature)[:, adam.axes]
@@ -104,7 +105,8 @@ class _Walk(torch.autograd.Function):
         pair, d, steps = CloudPair._make(fields), translation.shape[-1], ctx.steps
         scene, adam = steps.look(pair, rounding), HandAdam(steps.inner, d)
         totals, heats, speeds = scene.totals(), np.zeros(temperatures.shape), np.zeros(rates.shape)
-        back = Point(_embedded(cotangents[0], 0.0), _padded(cotangents[1]), *(x.numpy() for x in cotangents[2:4]))
+        by_translation, *by_moments = (x.numpy() for x in cotangents[1:4])
+        back = Point(_embedded(cotangents[0], 0.0), in_space(by_translation), *by_moments)
         for number in reversed(range(len(heats))):
             before, taken = ctx.points[number], Taken(ctx.gradients[number], ctx.points[number + 1])
             rate, count = rates[number].numpy(), steps.done + number + 1
@@ -137,7 +139,3 @@ def _embedded(rotation: Tensor, last: float) -> np.ndarray:
     whole = np.zeros((len(matrices), 3, 3))
     whole[:, :2, :2], whole[:, 2, 2] = matrices, last
     return whole
-
-
-def _padded(vectors: Tensor) -> np.ndarray:
-    return np.pad(vectors.numpy(), ((0, 0), (0, 3 - vectors.shape[-1])))

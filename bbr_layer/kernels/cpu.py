@@ -4,14 +4,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbr_layer.kernels.cpu_batch import COLUMN_OUT, DUAL, GRADIENT, ROW_OUT, Packed, Sums, run_sweeps
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Packed, Sums, run_sweeps
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHANNELS,
     COLUMN_CHANNELS,
+    COLUMN_OUT,
     CONSTANTS,
     COOL,
     COOL_RATE,
+    HEAT,
+    ROUND,
+    ROW_OUT,
     SMOOTH,
     VELOCITY,
     WEIGHT,
@@ -107,7 +111,7 @@ def _unpacked(scene: Scene, sums: Sums, order: int) -> Scene:
         P_weights=None if pair.P_weights is None else _share(sums.row_shares[:, order], pair.P_weights, pair.P_mask),
         Q_weights=None if pair.Q_weights is None else _share(sums.column_shares[:, order], pair.Q_weights, pair.Q_mask),
     )
-    heat, rounding = (torch.from_numpy(rows[:, k].sum(-1)) for k in (6, 7))
+    heat, rounding = (torch.from_numpy(rows[:, k].sum(-1)) for k in (HEAT, ROUND))
     return Scene(fields, heat / scene.temperature.square(), scene.rounding * rounding)
 
 

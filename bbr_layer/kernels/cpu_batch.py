@@ -17,12 +17,11 @@ from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
 from bbr_layer.kernels.cpu_dual_forces import point_force_rates
 from bbr_layer.kernels.cpu_dual_planes import plane_force_rates
 from bbr_layer.kernels.cpu_items import invert, settle_loss, settle_shares
+from bbr_layer.kernels.cpu_math import COLUMN_OUT, ROW_OUT
 from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators, plane_forces, point_forces
 
 # A single item is cut into at most this many parts, of at least this many pairs each.
 MOST_PARTS, PAIRS_PER_PART = 8, 2**17
-# Channels of the answer per row and per column, before their rates.
-ROW_OUT, COLUMN_OUT = 8, 6
 
 
 class Sweeps(NamedTuple):

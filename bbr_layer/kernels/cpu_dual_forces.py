@@ -1,6 +1,6 @@
 """The last sweep in dual numbers: forces and their rates of change; arguments as in ``cpu_dual.py``.
 
-What ``cpu_sweeps`` sums in channel c of rows is here in c, and its rate in c + 8; of columns in c and c + 6.
+What ``cpu_sweeps`` sums in channel c is here in c, and its rate ``ROW_OUT`` or ``COLUMN_OUT`` channels later.
 """
 
 import numpy as np
@@ -11,10 +11,14 @@ from bbr_layer.kernels.cpu_math import (
     BY_S,
     BY_S_RATE,
     CHUNK,
+    COLUMN_OUT,
     COOL,
     COOL_RATE,
+    HEAT,
     INVERSE,
     INVERSE_RATE,
+    ROUND,
+    ROW_OUT,
     SHARE,
     SHARE_RATE,
     SMOOTH,
@@ -38,8 +42,6 @@ from bbr_layer.kernels.cpu_pairs import (
     slope_rate,
     three,
 )
-
-ROW_RATES, COLUMN_RATES = 8, 6
 
 
 @compiled(forceinline=True)
@@ -66,7 +68,7 @@ def point_force_rates(rows, columns, normals, out, constants):  # type: ignore[n
         for first in range(0, columns.shape[1], TILE):
             last = min(first + TILE, columns.shape[1])
             (qx, qy, qz), (vx, vy, vz) = three(columns, 0, first, last), three(columns, VELOCITY, first, last)
-            f, g = three(sums, 0, first, last), three(sums, COLUMN_RATES, first, last)
+            f, g = three(sums, 0, first, last), three(sums, COLUMN_OUT, first, last)
             (weight, inverse, share) = three(columns, WEIGHT, first, last)
             inverse_rate, share_rate = columns[INVERSE_RATE, first:last], columns[SHARE_RATE, first:last]
             for i in range(low, high):
@@ -92,7 +94,7 @@ def point_force_rates(rows, columns, normals, out, constants):  # type: ignore[n
                     bx, by, bz = bx - x, by - y, bz - z
                     add_at(g, j, (x, y, z))
                 add_three(out[0], 0, i, (ax, ay, az))
-                add_three(out[0], ROW_RATES, i, (bx, by, bz))
+                add_three(out[0], ROW_OUT, i, (bx, by, bz))
                 add_sums(out[0], i, (heat, rounding), (heat_rate, rounding_rate))
         add_up(out[1], sums)
 
@@ -100,7 +102,7 @@ def point_force_rates(rows, columns, normals, out, constants):  # type: ignore[n
 @compiled(forceinline=True)
 def add_sums(out, i, sums, rates):  # type: ignore[no-untyped-def]
     """Add to the sums for temperature and rounding, and to their rates."""
-    out[6, i] += sums[0]
-    out[7, i] += sums[1]
-    out[6 + ROW_RATES, i] += rates[0]
-    out[7 + ROW_RATES, i] += rates[1]
+    out[HEAT, i] += sums[0]
+    out[ROUND, i] += sums[1]
+    out[HEAT + ROW_OUT, i] += rates[0]
+    out[ROUND + ROW_OUT, i] += rates[1]

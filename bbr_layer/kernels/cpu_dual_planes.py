@@ -2,12 +2,14 @@
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_dual_forces import COLUMN_RATES, ROW_RATES, add_sums, loss_rates, row_rates
+from bbr_layer.kernels.cpu_dual_forces import add_sums, loss_rates, row_rates
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHUNK,
+    COLUMN_OUT,
     INVERSE_RATE,
     ONE,
+    ROW_OUT,
     SHARE_RATE,
     SMOOTH,
     TILE,
@@ -112,15 +114,15 @@ def plane_force_rates(rows, columns, normals, out, constants):  # type: ignore[n
                     sign[j], push[j], push_rate[j], s, r = pushes(offsets, around, scales, (row, column, loss))
                     heat, rounding = heat + s[0], rounding + s[1]
                     heat_rate, rounding_rate = heat_rate + r[0], rounding_rate + r[1]
-                into = three(sums, 0, first, last), three(sums, COLUMN_RATES, first, last)
+                into = three(sums, 0, first, last), three(sums, COLUMN_OUT, first, last)
                 vectors = (nx, ny, nz), (mx, my, mz)
                 force, force_rate = add_products(into, normal, vectors, (push, push_rate), (sign, ones))
-                into = three(sums, 3, first, last), three(sums, COLUMN_RATES + 3, first, last)
+                into = three(sums, 3, first, last), three(sums, COLUMN_OUT + 3, first, last)
                 vectors = (qx, qy, qz), (vx, vy, vz)
                 torque, torque_rate = add_products(into, (-px, -py, -pz), vectors, (push, push_rate), (ones, sign))
                 add_three(out[0], 0, i, scaled(force, -ONE))
-                add_three(out[0], ROW_RATES, i, scaled(force_rate, -ONE))
+                add_three(out[0], ROW_OUT, i, scaled(force_rate, -ONE))
                 add_three(out[0], 3, i, torque)
-                add_three(out[0], ROW_RATES + 3, i, torque_rate)
+                add_three(out[0], ROW_OUT + 3, i, torque_rate)
                 add_sums(out[0], i, (heat, rounding), (heat_rate, rounding_rate))
         add_up(out[1], sums)

@@ -21,6 +21,10 @@ CHUNK = 64
 WEIGHT, INVERSE, SHARE, INVERSE_RATE, SHARE_RATE, CHANNELS = 3, 4, 5, 6, 7, 8
 # Channels that only columns have: velocity of the moved point.
 VELOCITY, COLUMN_CHANNELS = 8, 11
+# Channels of the gradient per row and per column, each followed by its rate where rates are asked for: force 0 to 2,
+# derivative by the normal 3 to 5; of rows also the sums of dL/du D for the temperature and dL/dD / D for the rounding.
+HEAT, ROUND = 6, 7
+ROW_OUT, COLUMN_OUT = 8, 6
 # Constants of an item: smoothing squared, 1 / alpha, derivatives of the loss by S and by M, 1 to align signs; then the
 # rates of change of alpha over alpha and of the two derivatives.
 SMOOTH, COOL, BY_S, BY_M, ALIGN, COOL_RATE, BY_S_RATE, BY_M_RATE, CONSTANTS = 0, 1, 2, 3, 4, 5, 6, 7, 8
@@ -55,7 +59,7 @@ float_of_bits: Any = intrinsic(inspect.unwrap(_float_of_bits))
 
 
 def exp_negative(x: float) -> float:
-    """exp(x) for x <= 0, to 2e-7 in float32 (where exp(-87) and less are 1e-38), to rounding in float64."""
+    """exp(x) for x <= 0: to rounding in float64; in float32 to 6e-8 |x|, as x itself is rounded; 1e-38 below -87."""
     return math.exp(x)
 
 

@@ -13,7 +13,9 @@ from bbr_layer.kernels.cpu_math import (
     BY_S,
     CHUNK,
     COOL,
+    HEAT,
     INVERSE,
+    ROUND,
     SHARE,
     SMOOTH,
     TILE,
@@ -100,7 +102,7 @@ def buddy_sums(rows, columns, normals, out, constants):  # type: ignore[no-untyp
 def point_forces(rows, columns, normals, out, constants):  # type: ignore[no-untyped-def]
     """The gradient of a point-to-point loss: the force on each row and column, channels 0 to 2 of both ``out``.
 
-    Channels 6 and 7 of ``out[0]``: sums of dL/du D and of dL/dD / D, for temperature and rounding.
+    Channels ``HEAT`` and ``ROUND`` of ``out[0]``: sums of dL/du D and of dL/dD / D, for temperature and rounding.
     """
     smooth, loss = constants[SMOOTH], (constants[COOL], constants[BY_S], constants[BY_M])
     sums = np.empty((3, columns.shape[1]), dtype=rows.dtype)
@@ -128,8 +130,8 @@ def point_forces(rows, columns, normals, out, constants):  # type: ignore[no-unt
                     gx, gy, gz = gx - x, gy - y, gz - z
                     add_at(f, j, (x, y, z))
                 add_three(out[0], 0, i, (gx, gy, gz))
-                out[0][6, i] += heat
-                out[0][7, i] += rounding
+                out[0][HEAT, i] += heat
+                out[0][ROUND, i] += rounding
         add_up(out[1], sums)
 
 
@@ -168,6 +170,6 @@ def plane_forces(rows, columns, normals, out, constants):  # type: ignore[no-unt
                     add_at(f, j, (x, y, z))
                 add_three(out[0], 0, i, (gx, gy, gz))
                 add_three(out[0], 3, i, (ux, uy, uz))
-                out[0][6, i] += heat
-                out[0][7, i] += rounding
+                out[0][HEAT, i] += heat
+                out[0][ROUND, i] += rounding
         add_up(out[1], sums)
