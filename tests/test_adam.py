@@ -81,6 +81,6 @@ def test_shared_moments_have_no_special_axis():
         ({"keep": "first"}, "keep is 'first'"),
     ],
 )
-def test_wrong_settings_are_refused(settings, sentence):
+def test_wrong_settings_are_refused(settings, sentence, as_a_user):
     with pytest.raises(ValueError, match=sentence):
         Adam(**settings)
