@@ -40,6 +40,13 @@ def test_vmap_is_a_batch(layer):
     _close([found], [layer(given["P"], given["Q"]).target_from_source.matrix])
 
 
+def test_vmap_over_a_dimension_in_the_middle(layer):
+    given = noisy_pair(3, batch=3)
+    P, Q = given["P"].movedim(0, 1), given["Q"].movedim(0, 2)
+    found = vmap(lambda P, Q: layer(P, Q).target_from_source.matrix, in_dims=(1, 2))(P, Q)
+    _close([found], [layer(given["P"], given["Q"]).target_from_source.matrix])
+
+
 def test_vmap_shares_what_is_not_mapped(layer):
     given = noisy_pair(3, batch=3)
     Q = given["Q"][0]
