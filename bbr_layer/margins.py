@@ -1,63 +1,107 @@
 """Nearest neighbours of slowly moving points: those that cannot have changed are not looked up again."""
 
+import importlib.util
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bbr_layer.trees import Tree, squared_length
+from bbr_layer.trees import Tree, in_space, squared_length
 
 # Computed lengths are off by a few 2^-53 of themselves; this share covers them many times over.
 ROUNDING = 1e-12
+COMPILED = importlib.util.find_spec("numba") is not None
+
+Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 
 class Margins:
-    """Exact nearest neighbours in a fixed tree, remembered from one asking to the next.
+    """Exact nearest neighbours of a moving cloud in a fixed tree, remembered from one asking to the next.
 
-    Found at ``y`` with nearest and second distances ``d1`` and ``d2``: at ``y'`` every other point is at least
-    ``d2 - |y' - y|`` away (triangle inequality), so the neighbour stays while its own distance is below that; which is
-    certain while ``|y' - y| < (d2 - d1) / 2``. Any order of askings gets the same answers.
+    Found at ``y``, with every other point at least ``r`` away: at ``y'`` every other point is at least ``r - |y' - y|``
+    away (triangle inequality), so the neighbour stays while its own distance is below that. Where it may have
+    changed, the new one is walked to from the old one (``kernels/cpu_walk.py``; not without Numba) or, where that
+    proves nothing, looked up in the tree. Any order of askings gets the same answers.
 
     Parameters
     ----------
     tree: the cloud that is searched.
-    count: how many moving points there are.
+    moving: ``(m, 3)`` the points before they move; those of the plane at height 0.
     kept: False looks up every point at every asking.
 
     Attributes
     ----------
-    asked, looked_up: how many neighbours were wanted so far, and how many of them the tree was searched for.
+    asked, searched, looked_up: how many neighbours were wanted so far, how many of them may have changed, and how
+        many of those the tree was searched for.
     """
 
-    def __init__(self, tree: Tree, count: int, kept: bool = True):
-        self.tree, self.kept = tree, kept
-        self.index = np.zeros(count, dtype=np.int64)
-        self.second = np.zeros(count)  # d2
-        self.free = np.full(count, -1.0)  # square of what a point may move for certain; -1: never looked up
-        self.places = np.zeros((count, tree.points.shape[1]))  # y
-        self.asked = self.looked_up = 0
+    def __init__(self, tree: Tree, moving: Float[np.ndarray, "m 3"], kept: bool = True):
+        self.tree, self.moving, self.kept = tree, np.ascontiguousarray(moving), kept
+        self.index = np.zeros(len(moving), dtype=np.int64)
+        self.reach = np.full(len(moving), -1.0)  # r; -1: never looked up
+        self.places = np.zeros((len(moving), 3))  # y
+        self.everybody = np.ones(len(moving), dtype=bool)
+        self.asked = self.searched = self.looked_up = 0
 
-    def nearest(
-        self, queries: Float[np.ndarray, "m d"], wanted: Bool[np.ndarray, "m"] | None = None
-    ) -> Int[np.ndarray, "m"]:
-        """Index of the nearest point of the tree, right for the ``wanted`` ones of the moving points (None: all)."""
-        asked = len(queries) if wanted is None else int(np.count_nonzero(wanted))
-        expired = self._expired(queries, wanted)
-        self.asked += asked
-        self.looked_up += len(expired)
-        if len(expired):
-            at = queries.take(expired, axis=0)
-            index, first, second = self.tree.nearest(at)
-            self.index[expired], self.second[expired], self.places[expired] = index, second, at
-            self.free[expired] = np.square((second - first) * (0.5 - ROUNDING))
+    def nearest(self, pose: Pose, wanted: Bool[np.ndarray, "m"] | None = None) -> Int[np.ndarray, "m"]:
+        """Index of the nearest point of the tree to each moved point, right for the ``wanted`` ones (None: all)."""
+        asked = self.everybody if wanted is None else wanted
+        searched, rows = self._changed(pose, asked)
+        self.asked += int(np.count_nonzero(asked))
+        self.searched += searched
+        self.looked_up += len(rows)
+        if len(rows):
+            at = _moved(pose, self.moving[rows])
+            self.index[rows], _, self.reach[rows] = self.tree.nearest(at[:, : self.tree.points.shape[1]])
+            self.places[rows] = at
         return self.index
 
-    def _expired(self, queries: np.ndarray, wanted: np.ndarray | None) -> Int[np.ndarray, "k"]:
-        """The wanted rows whose neighbour may have changed since it was found."""
+    def _changed(self, pose: Pose, wanted: np.ndarray) -> tuple[int, Int[np.ndarray, "k"]]:
+        """How many of the wanted neighbours may have changed, and the rows of those still to be looked up."""
         if not self.kept:
-            return np.arange(len(queries)) if wanted is None else np.flatnonzero(wanted)
-        offsets = queries - self.places
-        moved = np.einsum("md,md->m", offsets, offsets)
-        doubtful = ~(moved < self.free)
-        rows = np.flatnonzero(doubtful if wanted is None else doubtful & wanted)
-        at, own = queries.take(rows, axis=0), self.tree.points.take(self.index[rows], axis=0)
-        least = np.sqrt(squared_length(at - own)) + np.sqrt(moved[rows])
-        return rows[~(least * (1 + ROUNDING) < self.second[rows])]
+            rows = np.flatnonzero(wanted)
+            return len(rows), rows
+        if COMPILED and self.searched:
+            from bbr_layer.kernels import cpu_walk  # only where it is used: Numba takes long to load
+
+            memory = cpu_walk.Memory(self.index, self.reach, self.places)
+            lists = cpu_walk.Lists(*self.tree.lists(cpu_walk.LISTED))
+            return cpu_walk.refresh(lists, self.moving, pose, wanted, memory)
+        at = _moved(pose, self.moving)
+        moved = np.sqrt(squared_length(at - self.places))
+        own = np.sqrt(squared_length(at - in_space(self.tree.points.take(self.index, axis=0))))
+        rows = np.flatnonzero(wanted & ~((own + moved) * (1 + ROUNDING) < self.reach))
+        return len(rows), rows
+
+
+class MutualMargins:
+    """Mutual nearest neighbours of two clouds on the CPU, float64.
+
+    Parameters
+    ----------
+    P, Q: ``(n, d)`` and ``(m, d)``, at least one point each.
+    kept: False looks everything up at every asking.
+    """
+
+    def __init__(self, P: Float[np.ndarray, "n d"], Q: Float[np.ndarray, "m d"], kept: bool):
+        self.forth = Margins(Tree(P), in_space(Q), kept)
+        self.back = Margins(Tree(Q), in_space(P), kept)
+
+    def __call__(self, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
+        """For each point of Q the nearest of P with Q carried by ``pose``, and whether the choice is mutual.
+
+        The first is valid until the next call. P, carried back, is looked up in Q, and of it only the chosen points.
+        """
+        index = self.forth.nearest(pose)
+        back = pose[0].T.copy(), -pose[0].T @ pose[1]
+        if COMPILED:
+            from bbr_layer.kernels import cpu_walk
+
+            nearest_Q = self.back.nearest(back, cpu_walk.marked(index, len(self.back.moving)))
+            return index, cpu_walk.agreeing(index, nearest_Q)
+        chosen = np.zeros(len(self.back.moving), dtype=bool)
+        chosen[index] = True
+        return index, self.back.nearest(back, chosen)[index] == np.arange(len(index))
+
+
+def _moved(pose: Pose, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+    return points @ pose[0].T + pose[1]

@@ -1,7 +1,6 @@
 """Who is nearest to whom: exact nearest and mutual nearest neighbours. Indices only, never a gradient."""
 
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 import torch
@@ -10,8 +9,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.margins import Margins
-from bbr_layer.trees import Tree
+from bbr_layer.margins import Margins, MutualMargins, Pose
+from bbr_layer.trees import Tree, in_space
 
 # Pairs per tile of the brute-force search on accelerators: 2^24 float32 distances are 64 MiB.
 PAIRS_PER_TILE = 2**24
@@ -42,22 +41,26 @@ class MutualNeighbours:
         *,
         margins: bool = True,
     ):
-        items = zip(_items(P.detach(), P_mask), _items(Q.detach(), Q_mask), strict=True)
-        kind = partial(_Remembered, margins=margins) if P.device.type == "cpu" else _Tiled
-        self.items: list[_Remembered | _Tiled] = [kind(p, q) for (p, _), (q, _) in items]
-        self.P_rows = [kept for _, kept in _items(P, P_mask)]
-        self.Q_rows = [kept for _, kept in _items(Q, Q_mask)]
-        self.empty = torch.zeros(Q.shape[:2], dtype=torch.int64, device=Q.device)
+        self.P_rows, self.Q_rows = _rows(P, P_mask), _rows(Q, Q_mask)
+        clouds = zip(_real(P.detach(), self.P_rows), _real(Q.detach(), self.Q_rows), strict=True)
+        self.shape, self.device = Q.shape[:2], Q.device
+        # None where a cloud has no real point.
+        self.items: list[MutualMargins | _Tiled | None] = [self._item(p, q, margins) for p, q in clouds]
 
     @property
     def asked(self) -> int:
         """How many neighbours were wanted so far."""
-        return sum(item.asked for item in self.items)
+        return sum(side.asked for side in self._sides())
+
+    @property
+    def searched(self) -> int:
+        """How many of them may have changed since the motion before."""
+        return sum(side.searched for side in self._sides())
 
     @property
     def looked_up(self) -> int:
-        """How many of them a cloud was searched for."""
-        return sum(item.looked_up for item in self.items)
+        """How many of those a whole cloud was searched for."""
+        return sum(side.looked_up for side in self._sides())
 
     def __call__(self, motion: RigidMotion) -> tuple[Int[Tensor, "batch m"], Bool[Tensor, "batch m"]]:
         """For each source point the index of its nearest target point, and whether the choice is mutual.
@@ -69,50 +72,70 @@ class MutualNeighbours:
         motion: ``target_from_source`` of the moment, one per batch item.
         """
         motion = motion.detach()
-        nearest, mutual = self.empty.clone(), self.empty.bool()
-        for number, (item, P_rows, Q_rows) in enumerate(zip(self.items, self.P_rows, self.Q_rows, strict=True)):
-            if not len(item.P) or not len(item.Q):
-                continue
-            index, both = item(motion.item(number))
-            rows = slice(None) if Q_rows is None else Q_rows
-            nearest[number, rows] = index if P_rows is None else P_rows[index]
-            mutual[number, rows] = both
+        if self.device.type == "cpu":
+            rotation = in_space(in_space(motion.rotation.double().numpy()).swapaxes(1, 2)).swapaxes(1, 2)
+            translation = in_space(motion.translation.double().numpy())
+            found = [self.of_item(b, pose) for b, pose in enumerate(zip(rotation, translation, strict=True))]
+            tables = [(torch.from_numpy(index), torch.from_numpy(mutual)) for index, mutual in found]
+        else:
+            tables = [self._tiled(b, motion.item(b)) for b in range(len(self.items))]
+        nearest = torch.zeros(self.shape, dtype=torch.int64, device=self.device)
+        mutual = nearest.bool()
+        for b, (index, both) in enumerate(tables):
+            nearest[b], mutual[b] = index, both
         return nearest, mutual
 
+    def of_item(self, number: int, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
+        """The same on the CPU for one item, in numpy, its pose embedded in space; the index lasts until the next call.
 
-def _items(points: Tensor, mask: Tensor | None) -> Iterator[tuple[Tensor, Tensor | None]]:
-    """Each item's real points with their indices (None when all are)."""
-    for item in range(points.shape[0]):
-        kept = None if mask is None else mask[item].nonzero()[:, 0]
-        yield points[item] if kept is None else points[item][kept], kept
+        Embedded: a rotation of the plane has zeros, or a one in the corner, where it has no number.
+        """
+        item, P_rows, Q_rows = self.items[number], self.P_rows[number], self.Q_rows[number]
+        if P_rows is None and Q_rows is None and isinstance(item, MutualMargins):
+            return item((np.ascontiguousarray(pose[0]), np.ascontiguousarray(pose[1])))
+        nearest, mutual = np.zeros(self.shape[1], dtype=np.int64), np.zeros(self.shape[1], dtype=bool)
+        if isinstance(item, MutualMargins):
+            index, both = item((np.ascontiguousarray(pose[0]), np.ascontiguousarray(pose[1])))
+            rows = slice(None) if Q_rows is None else Q_rows
+            nearest[rows], mutual[rows] = index if P_rows is None else P_rows[index], both
+        return nearest, mutual
+
+    def _tiled(self, number: int, motion: RigidMotion) -> tuple[Tensor, Tensor]:
+        item, P_rows, Q_rows = self.items[number], self.P_rows[number], self.Q_rows[number]
+        nearest = torch.zeros(self.shape[1], dtype=torch.int64, device=self.device)
+        mutual = nearest.bool()
+        if isinstance(item, _Tiled):
+            index, both = item(motion)
+            rows = slice(None) if Q_rows is None else torch.from_numpy(Q_rows).to(self.device)
+            nearest[rows] = index if P_rows is None else torch.from_numpy(P_rows).to(self.device)[index]
+            mutual[rows] = both
+        return nearest, mutual
+
+    @staticmethod
+    def _item(P: Tensor, Q: Tensor, margins: bool) -> "MutualMargins | _Tiled | None":
+        if not len(P) or not len(Q):
+            return None
+        if P.device.type == "cpu":
+            return MutualMargins(P.double().numpy(), Q.double().numpy(), margins)
+        return _Tiled(P, Q)
+
+    def _sides(self) -> "Iterator[Margins | _Tiled]":
+        for item in self.items:
+            if isinstance(item, MutualMargins):
+                yield from (item.forth, item.back)
+            elif item is not None:
+                yield item
 
 
-class _Remembered:
-    """One pair of clouds on the CPU: look-ups in float64 trees, and the margins they were found with."""
+def _rows(points: Tensor, mask: Tensor | None) -> list[np.ndarray | None]:
+    """Each item's rows that are real, None where all are."""
+    return [None if mask is None else mask[b].nonzero()[:, 0].cpu().numpy() for b in range(len(points))]
 
-    def __init__(self, P: Tensor, Q: Tensor, margins: bool):
-        self.P, self.Q, self.margins = P.double(), Q.double(), margins
-        if len(P) and len(Q):
-            self.forth = Margins(Tree(self.P.numpy()), len(Q), margins)
-            self.back = Margins(Tree(self.Q.numpy()), len(P), margins)
 
-    @property
-    def asked(self) -> int:
-        return self.forth.asked + self.back.asked if len(self.P) and len(self.Q) else 0
-
-    @property
-    def looked_up(self) -> int:
-        return self.forth.looked_up + self.back.looked_up if len(self.P) and len(self.Q) else 0
-
-    def __call__(self, motion: RigidMotion) -> tuple[Tensor, Tensor]:
-        """Indices of the nearest target points and whether the choice is mutual, both ``(m,)``."""
-        motion = motion.to(torch.float64)
-        index = self.forth.nearest(motion(self.Q).numpy())
-        chosen = np.zeros(len(self.P), dtype=bool)
-        chosen[index] = True
-        nearest_Q = self.back.nearest(motion.inverse()(self.P).numpy(), chosen)
-        mutual = nearest_Q[index] == np.arange(len(self.Q))
-        return torch.from_numpy(index), torch.from_numpy(mutual)
+def _real(points: Tensor, rows: list[np.ndarray | None]) -> Iterator[Tensor]:
+    """Each item's real points."""
+    for item, kept in zip(points, rows, strict=True):
+        yield item if kept is None else item[torch.from_numpy(kept).to(item.device)]
 
 
 class _Tiled:
@@ -120,7 +143,7 @@ class _Tiled:
 
     def __init__(self, P: Tensor, Q: Tensor):
         self.P, self.Q = P, Q
-        self.asked = self.looked_up = 0
+        self.asked = self.searched = self.looked_up = 0
 
     def __call__(self, motion: RigidMotion) -> tuple[Tensor, Tensor]:
         """Indices of the nearest target points and whether the choice is mutual, both ``(m,)``."""
@@ -128,7 +151,7 @@ class _Tiled:
         P, Q = self.P.to(dtype), self.Q.to(dtype)
         index = nearest_by_tiles(motion(Q), P)
         nearest_Q = nearest_by_tiles(motion.inverse()(P), Q)
-        self.asked, self.looked_up = self.asked + len(P) + len(Q), self.looked_up + len(P) + len(Q)
+        self.asked = self.searched = self.looked_up = self.asked + len(P) + len(Q)
         return index, nearest_Q[index] == torch.arange(len(Q), device=Q.device)
 
 

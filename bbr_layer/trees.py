@@ -23,6 +23,7 @@ class Tree:
         self.points = points
         self.kept: np.ndarray | None = None  # which points are in the tree; None: all of them
         self.tree = KdTree(in_space(points))
+        self._lists: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.points) if self.kept is None else len(self.kept)
@@ -32,6 +33,7 @@ class Tree:
 
     def __setstate__(self, state: tuple) -> None:
         self.points, self.kept = state
+        self._lists = None
         self.tree = KdTree(in_space(self.points if self.kept is None else self.points[self.kept]))
 
     def candidates(self, queries: Float[np.ndarray, "m d"], count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -39,6 +41,17 @@ class Tree:
         index, squared = self.tree.batch_knn_search(in_space(queries), count)
         index = index.astype(np.int64)
         return squared, index if self.kept is None else self.kept[index]
+
+    def lists(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The points in space, each one's ``count`` nearest (int32), and a distance within which no other one lies.
+
+        Built at the first call.
+        """
+        if self._lists is None:
+            squared, index = self.candidates(self.points, min(count, len(self)))
+            reach = np.sqrt(squared[:, -1]) if count < len(self) else np.full(len(self.points), np.inf)
+            self._lists = np.ascontiguousarray(in_space(self.points)), index.astype(np.int32), reach
+        return self._lists
 
     def nearest(self, queries: Float[np.ndarray, "m d"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Index of the nearest point, its distance, and the distance of the next other one, each ``(m,)``."""
@@ -59,6 +72,7 @@ class Tree:
         """Keep the first of every set of coincident points: the others are never an answer, and crowd the ties."""
         self.kept = np.sort(np.unique(self.points, axis=0, return_index=True)[1])
         self.tree = KdTree(in_space(self.points[self.kept]))
+        self._lists = None
 
     def _first_of_ties(self, queries: np.ndarray) -> Int[np.ndarray, "m"]:
         found = np.zeros(len(queries), dtype=np.int64)

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals
+from bbr_layer.margins import Pose
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.normals import point_spacing
 from benchmarks.data import data_folder
@@ -74,20 +75,20 @@ def register(scans: Scans, rate: float) -> None:
 def recorded(scans: Scans, rate: float) -> tuple[Tensor, Tensor, list[RigidMotion]]:
     """Target, source and motions of the search that the registration's steps asked."""
     searches: dict[MutualNeighbours, list[RigidMotion]] = {}
-    begin, answer = MutualNeighbours.__init__, MutualNeighbours.__call__
+    begin, answer = MutualNeighbours.__init__, MutualNeighbours.of_item
     clouds: dict[MutualNeighbours, tuple[Tensor, Tensor]] = {}
 
     def spied_begin(self: MutualNeighbours, P: Tensor, Q: Tensor, *rest: Tensor | None) -> None:
         clouds[self] = P, Q
         begin(self, P, Q, *rest)
 
-    def spied_answer(self: MutualNeighbours, motion: RigidMotion) -> tuple[Tensor, Tensor]:
-        searches.setdefault(self, []).append(motion.detach())
-        return answer(self, motion)
+    def spied_answer(self: MutualNeighbours, number: int, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+        searches.setdefault(self, []).append(RigidMotion(*(torch.tensor(x[None]) for x in pose)))
+        return answer(self, number, pose)
 
     with (
         patch.object(MutualNeighbours, "__init__", spied_begin),
-        patch.object(MutualNeighbours, "__call__", spied_answer),
+        patch.object(MutualNeighbours, "of_item", spied_answer),
     ):
         register(scans, rate)
     longest = max(searches, key=lambda search: len(searches[search]))

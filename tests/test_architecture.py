@@ -16,14 +16,15 @@ ORDER = {
         rotations
         geometry
         pair trees
+        kernels
+        kernels.cpu_walk
         margins
         neighbours distances
         normals buddies temperature
-        kernels
         kernels.scene
         kernels.blocks kernels.forward_mode
         kernels.reference kernels.matched kernels.cpu_math kernels.gpu_pairs
-        kernels.cpu_pairs kernels.cpu_items kernels.gpu_sweeps kernels.gpu_clouds
+        kernels.cpu_pairs kernels.cpu_items kernels.cpu_matched kernels.gpu_sweeps kernels.gpu_clouds
         kernels.cpu_sweeps kernels.cpu_dual kernels.cpu_dual_forces kernels.gpu_forces
         kernels.cpu_dual_planes kernels.gpu
         kernels.cpu_batch

@@ -93,13 +93,14 @@ def test_coincident_points_have_finite_derivatives():
         _same(f, w, 1e-10)
 
 
-@pytest.mark.parametrize("name", ["softBBS", "softBD", "N"])
+@pytest.mark.parametrize("name", ["softBBS", "softBD", "N", "F"])
 def test_without_numba_the_answer_is_the_same(name, monkeypatch):
     given = noisy_pair(3)
     answers = []
     for installed in (True, False):
         if not installed:
             monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+            monkeypatch.setattr("bbr_layer.margins.COMPILED", False)
         P = given["P"].clone().requires_grad_()
         layer = BBRLayer(name, inner=Adam(5, 0.05), temperature=Annealed(1.0, 0.5), backward=Replay())
         matrix = layer(P, given["Q"]).target_from_source.matrix

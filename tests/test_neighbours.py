@@ -9,7 +9,7 @@ import torch
 from problems import motion, noisy_pair, unit
 from torch import Tensor
 
-from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals
+from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals, margins
 from bbr_layer.neighbours import MutualNeighbours, nearest_by_tiles, nearest_neighbours
 from bbr_layer.normals import SPACING_POINTS, point_spacing
 
@@ -62,17 +62,24 @@ def converging(d: int, batch: int, steps: int = 30) -> list[RigidMotion]:
     return found
 
 
+@pytest.fixture(params=["compiled", "plain"], autouse=True)
+def arithmetic(request, monkeypatch) -> None:
+    """Every test with the compiled walk from neighbour to neighbour, and without."""
+    monkeypatch.setattr("bbr_layer.margins.COMPILED", request.param == "compiled")
+
+
 @pytest.fixture
 def taken(monkeypatch) -> list[RigidMotion]:
     """The motions that a registration asks neighbours for, as it goes."""
     asked: list[RigidMotion] = []
-    answer = MutualNeighbours.__call__
+    answer = MutualNeighbours.of_item
 
-    def spy(self: MutualNeighbours, at: RigidMotion):
-        asked.append(at.detach())
-        return answer(self, at)
+    def spy(self: MutualNeighbours, number: int, pose: tuple[np.ndarray, np.ndarray]):
+        d = self.items[number].forth.tree.points.shape[1]
+        asked.append(RigidMotion(*(torch.tensor(x[None, :d]) for x in (pose[0][:, :d], pose[1]))))
+        return answer(self, number, pose)
 
-    monkeypatch.setattr(MutualNeighbours, "__call__", spy)
+    monkeypatch.setattr(MutualNeighbours, "of_item", spy)
     return asked
 
 
@@ -177,6 +184,17 @@ def test_margins_save_look_ups_on_the_way_and_change_no_answer():
     before = kept.looked_up
     kept(converging(3, 1)[-1])
     assert kept.looked_up == before  # nothing moved, nothing is looked up
+
+
+def test_neighbours_of_a_drift_are_walked_to():
+    cloud = torch.rand(1, 500, 3, dtype=torch.float64)
+    search = MutualNeighbours(cloud, cloud + 1e-3)
+    still = torch.eye(3).tolist()
+    drift = [shifted(still, [0.02 * step, 0.0, 0.0]) for step in range(20)]
+    for at in drift:
+        for found, wanted in zip(search(at), by_brute_force((cloud, cloud + 1e-3, None, None), at), strict=True):
+            assert torch.equal(found, wanted)
+    assert search.looked_up < 0.5 * search.searched or not margins.COMPILED
 
 
 def test_only_chosen_targets_are_looked_up_in_the_source():

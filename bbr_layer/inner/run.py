@@ -10,12 +10,11 @@ from torch import Tensor
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Moments
 from bbr_layer.inner.charts import RotationVector, State
-from bbr_layer.inner.matched_scene import MatchedScene
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.unroll import Problem, Progress, begin, detached, floor, share_done, step
 from bbr_layer.inner.walk import Scene, Steps, walk
 from bbr_layer.kernels import scene as kernel_scene
-from bbr_layer.kernels.choice import sweeps_for
+from bbr_layer.kernels.choice import backend, sweeps_for
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.soft import SoftKernel
 from bbr_layer.pair import CloudPair
@@ -69,12 +68,15 @@ def _look(problem: Problem) -> Callable[[CloudPair, Tensor], Scene] | None:
         return None
     if problem.temperature.learned or inner.keep != "last" or not isinstance(problem.chart, RotationVector):
         return None
-    if isinstance(loss.kernel, MatchedKernel):
+    # What is compiled is imported where it is used: Numba takes long to load, and may be missing.
+    if isinstance(loss.kernel, MatchedKernel) and backend("cpu").name == "numba":
+        from bbr_layer.inner.matched_scene import MatchedScene
+
         return partial(MatchedScene, loss.kernel)
     if isinstance(loss.kernel, SoftKernel):
         terms = loss.kernel.terms
         if sweeps_for(terms, kernel_scene.Scene(loss.pair, problem.unit, loss.rounding)).name == "numba":
-            from bbr_layer.inner.compiled_scene import CompiledScene  # only where it is used: Numba takes long to load
+            from bbr_layer.inner.compiled_scene import CompiledScene
 
             return partial(CompiledScene, terms)
     return None

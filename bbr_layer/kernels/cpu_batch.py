@@ -86,7 +86,7 @@ def run_sweeps(sweeps: Sweeps, packed: Packed, outlier: float, mean: bool) -> Su
     )
     parts = max(1, min(MOST_PARTS, n * m // PAIRS_PER_PART)) if batch == 1 else 1
 
-    _side_by_side(partial(_item, sweeps, packed, sums, (parts, outlier, mean)), batch)
+    side_by_side(partial(_item, sweeps, packed, sums, (parts, outlier, mean)), batch)
     return sums
 
 
@@ -115,7 +115,7 @@ def _sweep(sweeps: Sweeps, which: int, packed: Packed, cut: tuple[int, int], sum
     if parts == 1:
         _part(sweeps, (which, b), packed, tables, 0)
     else:
-        _side_by_side(partial(_part, sweeps, (which, b), packed, tables), parts)
+        side_by_side(partial(_part, sweeps, (which, b), packed, tables), parts)
         column_out += partial_sums.sum(0)
 
 
@@ -136,7 +136,7 @@ def _part(
         sweeps.planes[sweep](packed.rows[b][:, span], columns, normals, out, packed.constants[b])
 
 
-def _side_by_side(work: Callable[[int], None], count: int) -> None:
+def side_by_side(work: Callable[[int], None], count: int) -> None:
     """``work(0)`` to ``work(count - 1)`` on as many threads as torch is set to."""
     threads = min(torch.get_num_threads(), count)
     if threads == 1:
