@@ -6,13 +6,14 @@
 ``sequences`` writes DeepMapping's v1_pose0 (PCD), KITTI 00 and BALM (PLY) as folders of scans beside a file of their
 true poses, maps each folder as ``python -m train map`` does, and reports the error of the edges' map and of the
 trained one; the truth is read for that alone. Scans, maps and pictures stay in ``out/benchmark``. ``terms`` starts
-v1_pose0 (every 4th scan) from its true poses shaken by 5 px and 2 degrees, and trains it with every term, same seed
-and same epochs.
+v1_pose0 (every 4th scan) from its true poses shaken by 5 px and 2 degrees, and trains it with every term, same seed,
+epochs and rates, once with a free correction per scan and once with L-Net.
 """
 
 import argparse
 import time
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,8 +59,7 @@ SEQUENCES = {
 }
 WORK = Path("out", "benchmark")
 SHAKEN_PX, SHAKEN_DEG = 5.0, 2.0
-# Enough for L-Net to move scans by several point spacings, its unit of length.
-TERM_EPOCHS, TERM_RATE = 60, 1e-2
+LOCALISATIONS = ("direct", "network")
 
 
 def as_folder(chosen: Sequence, work: Path, stride: int = 1) -> tuple[Path, Path]:
@@ -119,13 +119,17 @@ def terms(names: list[str]) -> Iterator[str]:
     edges, _ = register_edges(scans, EdgeConfig())
     start = shaken(scans)
     yield f"The start is {ape(start, scans) * 512:.2f} px off; the edges of `residual` were registered from the scans."
-    yield from ("", "| term | px after training | kept epoch | seconds | CPU seconds |", "|---|---|---|---|---|")
-    for name in names:
-        training = TrainingConfig(term=name, epochs=TERM_EPOCHS, localisation_rate=TERM_RATE)
+    yield from (
+        "",
+        "| term | localisation | px after training | kept epoch | seconds | CPU seconds |",
+        "|---|---|---|---|---|---|",
+    )
+    for localisation, name in product(LOCALISATIONS, names):
+        training = TrainingConfig(term=name, localisation=localisation)
         clock = Clock()
         trained = train_map(scans, edges, start, MapConfig(training=training))
         error = ape(trained.world_from_scan, scans) * 512
-        yield f"| {name} | {error:.2f} | {trained.kept_epoch} | {clock.columns()} |"
+        yield f"| {name} | {localisation} | {error:.2f} | {trained.kept_epoch} | {clock.columns()} |"
 
 
 def main() -> None:

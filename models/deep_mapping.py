@@ -9,9 +9,8 @@ from torch import Tensor, nn
 
 from bbr_layer import RigidMotion
 from models.free_space import sample_free_space
-from models.localisation import LNet
 from models.occupancy import MNet
-from models.scan_batch import RegistrationTerm, ScanBatch
+from models.scan_batch import Localisation, RegistrationTerm, ScanBatch
 
 
 class MappingOutput(NamedTuple):
@@ -35,13 +34,13 @@ class DeepMapping(nn.Module):
 
     Parameters
     ----------
-    localisation: L-Net, scan to correction.
+    localisation: L-Net, scan to correction, or ``FreePoses``, a correction per scan.
     occupancy: M-Net, place to logit.
     registration_term: how neighbouring scans are compared.
     free_samples: points of free space per ray. Default 3.
     occupancy_weight, registration_weight: of the two losses in the total, not negative. Defaults 0.1 and 0.9,
         DeepMapping's in 2D.
-    translation_scale: length in the data's unit: an L-Net output of 1 moves a scan by it, and registration
+    translation_scale: length in the data's unit: a correction of 1 moves a scan by it, and registration
         losses count in it. A few point spacings to a tenth of a scan's range. Default 1.
 
     Raises
@@ -51,7 +50,7 @@ class DeepMapping(nn.Module):
 
     def __init__(
         self,
-        localisation: LNet,
+        localisation: Localisation,
         occupancy: MNet,
         registration_term: RegistrationTerm,
         *,
@@ -83,7 +82,7 @@ class DeepMapping(nn.Module):
         """Poses, world points and losses of one group; ``generator`` drives the free-space jitter."""
         batch = batch.without_padding()
         points, mask = batch.points, batch.mask
-        correction = self.localisation(points, mask)
+        correction = self.localisation.corrections(batch)
         world_from_scan = corrected_poses(batch, correction, self.translation_scale)
         world_points = torch.where(mask[..., None], world_from_scan(points), 0.0)
         world_free = world_from_scan(sample_free_space(points, mask, self.free_samples, generator))

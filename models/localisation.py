@@ -6,13 +6,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from models.scan_batch import Localisation, ScanBatch
+
 # Convolution along the scan: DeepMapping's kernel and dilation (Ding & Feng, CVPR 2019).
 KERNEL, DILATION = 3, 3
 # DeepMapping's widths: encoder 64-128-1024, head 512-256.
 PAPER_WIDTHS, PAPER_HEAD = (64, 128, 1024), (512, 256)
 
 
-class LNet(nn.Module):
+class LNet(Localisation):
     """Pose correction of each scan from its own points: rotation vector (radians), then translation.
 
     The last layer starts at zero, so the first correction is zero and training begins at the starting poses.
@@ -70,6 +72,9 @@ class LNet(nn.Module):
         """DeepMapping's widths: the ordered encoder in 2D, a PointNet of the same widths in 3D."""
         encoder = "ordered" if dimension == 2 else "unordered"
         return cls(dimension, encoder, widths=PAPER_WIDTHS, head=PAPER_HEAD, scale=scale)
+
+    def corrections(self, batch: ScanBatch) -> Float[Tensor, "g k"]:
+        return self(batch.points, batch.mask)
 
     def forward(self, points: Float[Tensor, "g n d"], mask: Bool[Tensor, "g n"]) -> Float[Tensor, "g k"]:
         """Correction ``(g, k)``, k = 3 in 2D and 6 in 3D; an empty scan has one too."""

@@ -1,4 +1,4 @@
-"""What the mapper reads, a padded group of scans and the edges between them; and what a term is."""
+"""What the mapper reads, a padded group of scans and the edges between them; and what its exchangeable parts are."""
 
 from abc import ABC, abstractmethod
 from typing import NamedTuple
@@ -59,6 +59,14 @@ class ScanBatch(NamedTuple):
             return clean.normals.detach()
         normals = estimate_normals(clean.points.detach(), mask=self.mask)
         return torch.where(self.mask[..., None], normals, 0.0)
+
+
+class Localisation(nn.Module, ABC):
+    """What corrects the poses of scans; its corrections begin at zero."""
+
+    @abstractmethod
+    def corrections(self, batch: ScanBatch) -> Float[Tensor, "g k"]:
+        """Rotation vector (radians), then translation (in the model's unit) of each scan; k = 3 in 2D, 6 in 3D."""
 
 
 class RegistrationTerm(nn.Module, ABC):

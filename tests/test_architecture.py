@@ -54,8 +54,8 @@ ORDER = {
         __main__
     """,
     "models": """
-        localisation occupancy free_space scan_batch
-        edge_clouds
+        occupancy free_space scan_batch
+        localisation free_poses edge_clouds
         buddy_term chamfer_terms residual_term
         registration_terms deep_mapping
         __init__

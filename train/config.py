@@ -17,6 +17,8 @@ Count = Annotated[int, Field(ge=1)]
 TERMS = {name: (name, TermSettings()) for name in REGISTRATION_TERMS if name != "buddy"} | {
     loss: ("buddy", TermSettings(loss=loss)) for loss in ("softBBS", "softBD", "N", "F")
 }
+# First learning rates: of free poses in point spacings a step, measured on DeepMapping's v1_pose0; of L-Net's weights.
+LOCALISATION_RATES = {"direct": 0.3, "network": 3e-3}
 # YAML's own values, nested by section.
 SettingsTree = Mapping[str, object]
 
@@ -57,7 +59,9 @@ class TrainingConfig(Settings):
     points: most points of a scan in one step, drawn anew in every epoch.
     free_samples: points of free space per ray.
     occupancy_weight, registration_weight: of the two losses.
-    localisation_rate, occupancy_rate: first learning rates of L-Net and M-Net (Adam, cosine to 0).
+    localisation: what corrects poses: "direct", a correction of its own for each scan, or "network", L-Net.
+    localisation_rate: first learning rate of that (Adam, cosine to 0); None: ``LOCALISATION_RATES``.
+    occupancy_rate: first learning rate of M-Net.
     encoder: of L-Net: "ordered" for 2D scans in the order of their rays, "unordered" for any, "auto" for ordered in
         2D and unordered in 3D.
     size: of L-Net and M-Net: "small" for seconds on a CPU, "paper" for DeepMapping's networks, encoder included.
@@ -72,10 +76,17 @@ class TrainingConfig(Settings):
     free_samples: Count = 3
     occupancy_weight: Annotated[float, Field(ge=0)] = 0.1
     registration_weight: Annotated[float, Field(ge=0)] = 0.9
-    localisation_rate: Annotated[float, Field(gt=0)] = 3e-3
+    localisation: Literal["direct", "network"] = "direct"
+    localisation_rate: Annotated[float, Field(gt=0)] | None = None
     occupancy_rate: Annotated[float, Field(gt=0)] = 5e-3
     encoder: Literal["auto", "ordered", "unordered"] = "auto"
     size: Literal["small", "paper"] = "small"
+
+    @property
+    def first_localisation_rate(self) -> float:
+        """The rate given, or that of the kind of localisation."""
+        rate = self.localisation_rate
+        return LOCALISATION_RATES[self.localisation] if rate is None else rate
 
     @field_validator("term")
     @classmethod

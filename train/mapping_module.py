@@ -10,7 +10,16 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 
 from bbr_layer import RigidMotion
-from models import DeepMapping, LNet, MNet, ScanBatch, corrected_poses, registration_term
+from models import (
+    DeepMapping,
+    FreePoses,
+    LNet,
+    Localisation,
+    MNet,
+    ScanBatch,
+    corrected_poses,
+    registration_term,
+)
 from train.config import TERMS, TrainingConfig
 from train.data_module import MappingData
 from train.schedule import Schedule
@@ -24,7 +33,7 @@ FREE_SPACE_STREAM = 1
 
 
 class MappingModule(L.LightningModule):
-    """DeepMapping with its optimiser: a learning rate for L-Net and one for M-Net, each on its own schedule.
+    """DeepMapping with its optimiser: a learning rate for the poses and one for M-Net, each on its own schedule.
 
     Parameters
     ----------
@@ -54,7 +63,7 @@ class MappingModule(L.LightningModule):
         others = [*self.model.occupancy.parameters(), *self.model.registration_term.parameters()]
         optimiser = torch.optim.Adam(
             [
-                {"params": localisation, "lr": self.config.localisation_rate},
+                {"params": localisation, "lr": self.config.first_localisation_rate},
                 {"params": others, "lr": self.config.occupancy_rate},
             ]
         )
@@ -72,7 +81,7 @@ class MappingModule(L.LightningModule):
         found = []
         for batch in batches:
             here = self.transfer_batch_to_device(batch, self.device, 0)
-            correction = self.model.localisation(here.points, here.mask)
+            correction = self.model.localisation.corrections(here)
             found.append(corrected_poses(here, correction, self.model.translation_scale).to("cpu"))
         return RigidMotion(torch.cat([m.rotation for m in found]), torch.cat([m.translation for m in found]))
 
@@ -87,7 +96,8 @@ class MappingModule(L.LightningModule):
 def build_module(data: MappingData, config: TrainingConfig, *, seed: int) -> MappingModule:
     """Networks of the size of the scans and of the starting map, their first weights drawn from ``seed``.
 
-    L-Net's unit of length is the scans' median point spacing: what a starting map of registered edges may be off.
+    The unit of length of corrections is the scans' median point spacing: what a starting map of registered edges may be
+    off.
     """
     points = torch.cat([scan.points[scan.trained] for scan in data.prepared])
     far = torch.quantile(_thinned(torch.linalg.vector_norm(points, dim=1)), FAR).item() or 1.0
@@ -95,7 +105,8 @@ def build_module(data: MappingData, config: TrainingConfig, *, seed: int) -> Map
     name, settings = TERMS[config.term]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        localisation, occupancy = _networks(points.shape[1], far, config)
+        localisation = _localisation(len(data.prepared), points.shape[1], (far, spacing), config)
+        occupancy = MNet.paper(points.shape[1]) if config.size == "paper" else MNet(points.shape[1])
     model = DeepMapping(
         localisation,
         occupancy,
@@ -110,12 +121,16 @@ def build_module(data: MappingData, config: TrainingConfig, *, seed: int) -> Map
     return MappingModule(model, config, seed=seed)
 
 
-def _networks(dimension: int, far: float, config: TrainingConfig) -> tuple[LNet, MNet]:
+def _localisation(count: int, dimension: int, lengths: tuple[float, float], config: TrainingConfig) -> Localisation:
+    """What corrects poses; ``lengths`` are how far the scans reach and their point spacing."""
+    far, spacing = lengths
+    if config.localisation == "direct":
+        return FreePoses(count, dimension, turn=spacing / far)
     if config.size == "paper":
-        return LNet.paper(dimension, scale=far), MNet.paper(dimension)
+        return LNet.paper(dimension, scale=far)
     by_dimension = "ordered" if dimension == 2 else "unordered"
     encoder = by_dimension if config.encoder == "auto" else config.encoder
-    return LNet(dimension, encoder, scale=far), MNet(dimension)
+    return LNet(dimension, encoder, scale=far)
 
 
 def _thinned(values: Tensor) -> Tensor:
