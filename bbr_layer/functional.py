@@ -31,7 +31,13 @@ def register(P: Array, Q: Array, *, layer: BBRLayer | None = None, **given: Arra
     chosen = BBRLayer() if layer is None else layer
     if isinstance(P, torch.Tensor):
         return chosen(P, Q, **given)
-    tensors = {name: torch.as_tensor(x) if isinstance(x, np.ndarray) else x for name, x in given.items()}
-    result = chosen(torch.as_tensor(P), torch.as_tensor(Q), **tensors)
+    tensors = {name: _as_tensor(name, x) if isinstance(x, np.ndarray) else x for name, x in given.items()}
+    result = chosen(_as_tensor("P", P), _as_tensor("Q", Q), **tensors)
     motion = RigidMotion(*(x.detach().numpy() for x in result.target_from_source))
     return Registration(motion, *(x.detach().numpy() for x in result[1:]))
+
+
+def _as_tensor(name: str, array: Array) -> torch.Tensor:
+    if isinstance(array, np.ndarray) and array.dtype.kind not in "biufc":
+        raise ValueError(f"{name} is an array of {array.dtype}; it must hold numbers: try {name}.astype(float)")
+    return torch.as_tensor(array)

@@ -143,6 +143,14 @@ def test_copies_pickles_and_says_what_it_is():
     assert "SoftBD(smoothing=0.2" in repr(layer) and "Truncated(last_steps=3)" in repr(layer)
 
 
+def test_register_refuses_arrays_that_hold_no_numbers():
+    P = np.random.default_rng(0).random((20, 3))
+    with pytest.raises(ValueError, match="Q is an array of <U.*; it must hold numbers"):
+        register(P, P.astype(str))
+    with pytest.raises(ValueError, match="P_weights is an array of object"):
+        register(P, P, P_weights=np.full(20, None))
+
+
 def test_register_answers_numpy_with_numpy():
     P = _surface().numpy()
     result = register(P, P + 0.01)
