@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bbr_layer import Adam, BBRLayer, Registration, RigidMotion
+from bbr_layer import Adam, BBRLayer, Implicit, Registration, RigidMotion
 
 FACTOR = 2.0
 
@@ -61,6 +61,11 @@ def test_an_exact_copy_of_a_surface(n):
 def test_an_exact_copy_of_a_curve_registered_by_f():
     # Soft buddies of a curve are left out: at a rate far above the spacing of its points their unroll is chaotic.
     assert_honest(shares_of_sensitivity(BBRLayer("F"), bumpy(100, 2)))
+
+
+@pytest.mark.parametrize("n", [100, 500])
+def test_an_exact_copy_of_a_curve_through_the_optimum(n):
+    assert_honest(shares_of_sensitivity(BBRLayer(backward=Implicit()), bumpy(n, 2)))
 
 
 @pytest.mark.parametrize("name", ["bun_zipper", "horse", "dragon_vrip_res3"])
