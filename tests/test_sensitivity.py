@@ -53,7 +53,7 @@ def assert_honest(shares: Tensor) -> None:
     assert ((shares > 1 / FACTOR) & (shares < FACTOR)).all(), shares
 
 
-@pytest.mark.parametrize("n", [100, 250, 500])
+@pytest.mark.parametrize("n", [100, 500])
 def test_an_exact_copy_of_a_surface(n):
     assert_honest(shares_of_sensitivity(BBRLayer(), bumpy(n, 3)))
 
