@@ -3,7 +3,8 @@
     python -m benchmarks.layer --out benchmarks/layer.md
 
 Every cell of the first table runs in a process of its own, on one thread, in float32: the best of three after one run
-that compiles, and the growth of the process's peak memory over what it held before. Rivals: the plain differentiable
+that compiles, and the growth of the process's peak memory over what it held before (what that first run, on fewer
+points, left in the heap is held). Rivals: the plain differentiable
 unroll (``Autograd()``), the same with every step checkpointed, and TorchOpt's MetaAdam (``pip install torchopt``).
 """
 
@@ -11,7 +12,6 @@ import argparse
 import importlib.util
 import multiprocessing
 import os
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -24,9 +24,9 @@ from torch import Tensor
 from bbr_layer import Adam, Autograd, BBRLayer, Implicit, Replay
 from benchmarks import layer_gradients, layer_rivals, layer_sweeps
 from benchmarks.layer_problems import clouds
+from benchmarks.memory import forget_peak, peak
 
 STEPS, RATE = 30, 0.05
-MIB = 1024.0  # getrusage counts KiB
 LOSSES = ("softBD", "softBBS", "N")
 # Points of the first run of the compiled sweeps: enough for a pair to be cut into parts, which is compiled apart.
 WARM_POINTS = 600
@@ -68,7 +68,7 @@ def measured(name: str, who: str, n: int, steps: int) -> Cell:
     few = WARM_POINTS if "compiled" in who else 50
     warm = [x.detach()[:few].clone().requires_grad_() for x in (P, Q)]
     torch.autograd.grad(register(*warm).square().sum(), warm)  # compiles, and loads what is loaded once
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    held = forget_peak()
     times = []
     for _ in range(1 if who in ("plain unroll", "TorchOpt MetaAdam") and n > 500 else 3):
         begin = time.perf_counter()
@@ -76,8 +76,7 @@ def measured(name: str, who: str, n: int, steps: int) -> Cell:
         middle = time.perf_counter()
         torch.autograd.grad(matrix.square().sum(), (P, Q))
         times.append((middle - begin, time.perf_counter() - begin))
-    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / MIB
-    return Cell(min(t[0] for t in times), min(t[1] for t in times), grown)
+    return Cell(min(t[0] for t in times), min(t[1] for t in times), peak() - held)
 
 
 def in_own_process(function: Callable, *arguments: object) -> object:

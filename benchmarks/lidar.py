@@ -22,11 +22,11 @@ from bbr_layer.margins import Pose
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.normals import point_spacing
 from benchmarks.data import data_folder
+from benchmarks.memory import forget_peak, peak
 
 PAIR = "pair_kitti00_95_94"
 STEPS = 100
 RATES = (0.005, 0.02)  # F's default, and one at which the source leaps from step to step
-KIB_PER_MIB = 1024
 
 
 class Scans(NamedTuple):
@@ -53,17 +53,10 @@ def best(work: Callable[[], object], repeats: int) -> float:
 
 
 def peak_memory(work: Callable[[], object]) -> float:
-    """MiB of resident memory at the peak above those at the beginning; Linux only."""
-    Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
-    before = resident("VmRSS")
+    """MiB of resident memory at the peak above those at the beginning."""
+    held = forget_peak()
     work()
-    return (resident("VmHWM") - before) / KIB_PER_MIB
-
-
-def resident(name: str) -> int:
-    """One line of the process's status, KiB."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(name))
+    return peak() - held
 
 
 def register(scans: Scans, rate: float) -> None:
