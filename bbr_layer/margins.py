@@ -5,10 +5,8 @@ import importlib.util
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bbr_layer.trees import Tree, in_space, squared_length
+from bbr_layer.trees import ROUNDING, Tree, in_space, squared_length
 
-# Computed lengths are off by a few 2^-53 of themselves; this share covers them many times over.
-ROUNDING = 1e-12
 COMPILED = importlib.util.find_spec("numba") is not None
 
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
@@ -64,7 +62,7 @@ class Margins:
             from bbr_layer.kernels import cpu_walk  # only where it is used: Numba takes long to load
 
             memory = cpu_walk.Memory(self.index, self.reach, self.places)
-            lists = cpu_walk.Lists(*self.tree.lists(cpu_walk.LISTED))
+            lists = cpu_walk.Lists(*self.tree.lists())
             return cpu_walk.refresh(lists, self.moving, pose, wanted, memory)
         at = _moved(pose, self.moving)
         moved = np.sqrt(squared_length(at - self.places))

@@ -91,13 +91,14 @@ class MutualNeighbours:
         Embedded: a rotation of the plane has zeros, or a one in the corner, where it has no number.
         """
         item, P_rows, Q_rows = self.items[number], self.P_rows[number], self.Q_rows[number]
-        if P_rows is None and Q_rows is None and isinstance(item, MutualMargins):
-            return item((np.ascontiguousarray(pose[0]), np.ascontiguousarray(pose[1])))
         nearest, mutual = np.zeros(self.shape[1], dtype=np.int64), np.zeros(self.shape[1], dtype=bool)
-        if isinstance(item, MutualMargins):
-            index, both = item((np.ascontiguousarray(pose[0]), np.ascontiguousarray(pose[1])))
-            rows = slice(None) if Q_rows is None else Q_rows
-            nearest[rows], mutual[rows] = index if P_rows is None else P_rows[index], both
+        if not isinstance(item, MutualMargins):
+            return nearest, mutual
+        index, both = item((np.ascontiguousarray(pose[0]), np.ascontiguousarray(pose[1])))
+        index = index if P_rows is None else P_rows[index]
+        if Q_rows is None:
+            return index, both
+        nearest[Q_rows], mutual[Q_rows] = index, both
         return nearest, mutual
 
     def _tiled(self, number: int, motion: RigidMotion) -> tuple[Tensor, Tensor]:

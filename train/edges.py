@@ -15,8 +15,8 @@ from train.scans import Progress, ScanSet, silent
 BATCH = 32
 # An edge whose share of mutual pairs is below this part of the chain's median is sought again from other starts.
 POOR = 0.6
-# F's steps and first rate. Measured against 60 at 0.02: a fifth of the error on the BALM sequence, less than half on
-# DeepMapping's v1_pose0. Twice the layer's own rate, as scans lie farther apart than what soft buddies leave.
+# F's steps and first rate: benchmarks/mapping_sequences.md has the errors; 60 at 0.02 left more than twice that of
+# v1_pose0. Twice the layer's own rate, as scans lie farther apart than what soft buddies leave.
 EDGE_STEPS, EDGE_RATE = 200, 0.01
 # Turns tried for such an edge, radians about the vertical axis: measured, they win sequences of one scan a second.
 YAW_STARTS = np.deg2rad([0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0])

@@ -33,8 +33,7 @@ class MatchedScene:
 
     def totals(self) -> Totals:
         """Zeros, to be added to."""
-        n, m = (self.clouds[0].P.shape[0], self.clouds[0].Q.shape[0]) if self.clouds else (0, 0)
-        return Totals.zero(len(self.clouds), n, m)
+        return Totals.zero(len(self.clouds), len(self.clouds[0].P), len(self.clouds[0].Q))
 
     def slope(self, at: Point, temperature: np.ndarray) -> np.ndarray:
         """The loss's gradient by a further turn and shift of the pose, ``(batch, 6)``."""

@@ -18,7 +18,7 @@ NAMES = ("numba", "triton", "torch")
 
 
 class Backend(NamedTuple):
-    """What computes the sweeps of the soft losses.
+    """What computes the closed forms of the losses.
 
     Parameters
     ----------

@@ -12,11 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-# Points in a list. Measured on two full lidar scans: with 16 a third of the searches still needs the tree, with 8 a
-# half; 24 save no time any more.
-LISTED = 16
-# Computed lengths are off by a few 2^-53 of themselves; this share covers them many times over.
-ROUNDING = 1e-12
+from bbr_layer.trees import ROUNDING
 
 
 def exact(function):  # type: ignore[no-untyped-def]
