@@ -17,17 +17,20 @@ ORDER = {
         geometry
         pair trees
         kernels
-        kernels.cpu_walk
+        kernels.cpu_math kernels.cpu_threads
+        kernels.cpu_walk kernels.cpu_turns
+        kernels.cpu_adam
         margins
         neighbours distances
         normals buddies temperature
         kernels.scene
         kernels.blocks kernels.forward_mode
-        kernels.reference kernels.matched kernels.cpu_math kernels.gpu_pairs
-        kernels.cpu_pairs kernels.cpu_items kernels.cpu_matched kernels.gpu_sweeps kernels.gpu_clouds
-        kernels.cpu_sweeps kernels.cpu_dual kernels.cpu_dual_forces kernels.gpu_forces
+        kernels.reference kernels.matched kernels.gpu_pairs
+        kernels.cpu_pairs kernels.cpu_matched kernels.gpu_sweeps kernels.gpu_clouds
+        kernels.cpu_sweeps kernels.cpu_forces kernels.cpu_dual kernels.cpu_dual_forces kernels.gpu_forces
         kernels.cpu_dual_planes kernels.gpu
-        kernels.cpu_batch
+        kernels.cpu_items
+        kernels.cpu_batch kernels.cpu_course
         kernels.cpu
         kernels.choice
         kernels.soft
@@ -37,9 +40,8 @@ ORDER = {
         inner
         inner.schedules inner.charts inner.once
         inner.adam inner.pose_gradient
-        inner.unroll inner.adam_by_hand
-        inner.compiled_scene inner.matched_scene
-        inner.walk
+        inner.unroll
+        inner.compiled_scene inner.matched_scene inner.walk
         inner.run inner.implicit
         backward transforms preparation
         stage

@@ -1,4 +1,4 @@
-"""The compiled sweeps against those in torch, and the optimiser in numpy against the one in torch."""
+"""The compiled sweeps against those in torch, and the compiled optimiser against the one in torch."""
 
 import importlib.util
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from problems import noisy_pair
+from scipy.spatial.transform import Rotation
 
 from bbr_layer import Adam, Annealed, BBRLayer, CloudPair, Replay, RigidMotion, backend
 from bbr_layer.inner.adam import Moments, adam_direction
@@ -13,8 +14,8 @@ from bbr_layer.kernels.reference import soft_directional, soft_gradient
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 
 pytest.importorskip("numba", reason="the compiled sweeps need numba")
-from bbr_layer.inner import adam_by_hand  # noqa: E402
-from bbr_layer.kernels import cpu, cpu_batch  # noqa: E402
+from bbr_layer.inner.walk import AXES  # noqa: E402
+from bbr_layer.kernels import cpu, cpu_adam, cpu_batch, cpu_turns  # noqa: E402
 
 # Sums that are 0 but for their rounding.
 ROUNDING = 1e-15
@@ -121,33 +122,68 @@ def test_the_backend_says_what_it_is_and_may_be_named(monkeypatch):
 
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("d", [2, 3])
-def test_adam_by_hand_is_adam(d, shared, rng):
-    hand = adam_by_hand.HandAdam(Adam(shared=shared), d)
-    k = len(hand.axes)
-    at = adam_by_hand.Point(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.zeros((2, k)), np.zeros((2, k)))
-    moments, motion = Moments.zero(torch.zeros(2, k, dtype=torch.float64)), RigidMotion.identity(3, (2,))
-    for number in range(1, 4):
-        gradient, rate = rng.normal(size=(2, k)), rng.uniform(0.01, 0.1, size=k)
-        gradient[1, 0] = 0.0  # a component that has never moved
-        blocks = (k - d, d) if shared else None
+def test_compiled_adam_is_adam(d, shared, rng):
+    steps, axes = 4, AXES[d]
+    k, free = len(axes), np.isin(np.arange(6), axes).astype(float)
+    rates = np.zeros((steps, 6))
+    rates[:, axes] = rng.uniform(0.01, 0.1, size=(steps, k))
+    course = cpu_adam.Course(np.ones(steps), rates, free, (0.9, 0.999, 1e-8), shared, 0)
+    shapes = (steps + 1, 3, 3), (steps + 1, 3), (steps + 1, 6), (steps + 1, 6), (steps, 6)
+    trace = cpu_adam.Trace(*map(np.zeros, shapes))
+    trace.rotations[0] = np.eye(3)
+    moments, motion = Moments.zero(torch.zeros(1, k, dtype=torch.float64)), RigidMotion.identity(3, (1,))
+    for step in range(steps):
+        trace.gradients[step] = rng.normal(size=6)
+        trace.gradients[step, 2] = 0.0  # a component that has never moved
         direction, moments = adam_direction(
-            torch.from_numpy(gradient), moments, betas=(0.9, 0.999), eps=1e-8, blocks=blocks
+            torch.from_numpy(trace.gradients[step : step + 1, axes].copy()),
+            moments,
+            betas=(0.9, 0.999),
+            eps=1e-8,
+            blocks=(k - d, d) if shared else None,
         )
-        at = hand.advance(at, gradient, rate, number)
-        move = torch.zeros(2, 6, dtype=torch.float64)
-        move[:, hand.axes] = -torch.from_numpy(rate) * direction
-        step = RigidMotion.from_rotvec(move[:, :3], move[:, 3:])
-        motion = RigidMotion(step.rotation @ motion.rotation, motion.translation + step.translation)
-    for found, wanted in zip(at, (*motion, moments.first, moments.second), strict=True):
-        np.testing.assert_allclose(found, wanted.numpy(), rtol=1e-13, atol=1e-15)
+        cpu_adam.advance(course, trace, step)
+        move = torch.zeros(1, 6, dtype=torch.float64)
+        move[:, axes] = -torch.from_numpy(rates[step, axes]) * direction
+        turn = RigidMotion.from_rotvec(move[:, :3], move[:, 3:])
+        motion = RigidMotion(turn.rotation @ motion.rotation, motion.translation + turn.translation)
+    wanted = (*motion, moments.first, moments.second)
+    found = trace.rotations[-1], trace.translations[-1], trace.firsts[-1, axes], trace.seconds[-1, axes]
+    for f, w in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(f, w[0].numpy(), rtol=1e-13, atol=1e-15)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, np.pi])
-def test_left_jacobian_is_the_derivative_of_the_exponential(angle):
-    vector = angle * np.array([[0.6, -0.8, 0.0]])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 9.9e-3, 1.01e-2, 1.0, np.pi])
+def test_the_exponential_and_its_derivative(angle):
+    vector = angle * np.array([0.6, -0.8, 0.0])
+    turn = cpu_turns.exponential(tuple(vector))
+    np.testing.assert_allclose(turn, Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
     for axis in np.eye(3):
-        step = 1e-6 * axis[None]
-        ahead, behind = (adam_by_hand.exponential(vector + s) for s in (step, -step))
-        turned = (ahead - behind) / 2e-6 @ adam_by_hand.transposed(adam_by_hand.exponential(vector))
-        wanted = adam_by_hand.hat(adam_by_hand.left_jacobian(vector) @ axis)
-        np.testing.assert_allclose(turned, wanted, atol=1e-8)
+        ahead, behind = (cpu_turns.exponential(tuple(vector + s)) for s in (1e-6 * axis, -1e-6 * axis))
+        turned = (ahead - behind) / 2e-6 @ turn.T
+        for torque in np.eye(3):
+            found = axis @ np.array(cpu_turns.through_exponential(tuple(vector), tuple(torque)))
+            wanted = torque @ np.array(cpu_turns.axial(turned)) / 2
+            np.testing.assert_allclose(found, wanted, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["softBBS", "softBD", "N"])
+def test_a_large_pair_in_parts_is_the_same(name, monkeypatch):
+    given, answers = noisy_pair(3, batch=1), []
+    for pairs in (cpu_batch.PAIRS_PER_PART, 100):
+        monkeypatch.setattr(cpu_batch, "PAIRS_PER_PART", pairs)
+        P = given["P"].clone().requires_grad_()
+        matrix = BBRLayer(name, inner=Adam(5, 0.05))(P, given["Q"]).target_from_source.matrix
+        answers.append((matrix.detach(), *torch.autograd.grad(matrix.square().sum(), P)))
+    for whole, parted in zip(*answers, strict=True):
+        torch.testing.assert_close(whole, parted, rtol=1e-11, atol=1e-13)
+
+
+def test_what_is_kept_of_the_pairs_changes_nothing(monkeypatch):
+    scene, direction = _scene(3, False, torch.float64)
+    with_it = cpu.directional(TERMS["softBD"], scene, direction)
+    loss, _ = cpu.gradient(TERMS["softBD"], scene)
+    monkeypatch.setattr(cpu_batch, "KEPT_PAIRS", 0)
+    for f, w in zip(with_it, cpu.directional(TERMS["softBD"], scene, direction), strict=True):
+        _same(f, w, 1e-12)
+    torch.testing.assert_close(loss, cpu.gradient(TERMS["softBD"], scene)[0], rtol=1e-13, atol=0)

@@ -1,15 +1,17 @@
-"""A pair of clouds packed once for the compiled sweeps, and looked at from one pose after the other."""
+"""A pair of clouds packed once for the compiled sweeps; the whole loop is compiled, but a large item goes in parts."""
 
 import numpy as np
-import torch
-from torch import Tensor
+from torch import Tensor, ones_like
 
-from bbr_layer.inner.adam_by_hand import Point, Totals, axial, hat, transposed
-from bbr_layer.kernels.cpu import FAR, LONG_NORMAL, pack
-from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Sums, run_sweeps
-from bbr_layer.kernels.cpu_math import COLUMN_OUT, COOL, HEAT, ROUND, ROW_OUT, VELOCITY
+from bbr_layer.kernels import cpu_course
+from bbr_layer.kernels.cpu import pack
+from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, parts_of, room_to_keep, run_item
+from bbr_layer.kernels.cpu_course import Adjoint, Cloud
+from bbr_layer.kernels.cpu_items import Loss
 from bbr_layer.kernels.scene import Scene, SoftTerms
 from bbr_layer.pair import CloudPair
+from bbr_layer.trees import in_space
 
 
 class CompiledScene:
@@ -23,72 +25,57 @@ class CompiledScene:
     """
 
     def __init__(self, terms: SoftTerms, pair: CloudPair, rounding: Tensor):
-        self.terms, self.rounding = terms, rounding.detach().double().numpy()
-        self.packed = pack(terms, Scene(pair, torch.ones_like(rounding), rounding))
-        self.padded = None if pair.Q_mask is None else ~pair.Q_mask.numpy()[:, None]
-        self.points = self._unpadded(self.packed.columns[:, :3])
-        normals = self.packed.column_normals
-        self.normals = None if normals is None else self._unpadded(normals[:, :3])
+        self.pair, self.rounding = pair, rounding.detach().double().numpy()
+        self.packed = pack(terms, Scene(pair, ones_like(rounding), rounding))
+        self.loss = Loss(terms.outlier, terms.mean)
+        self.batch, n, m = len(pair.P), pair.P.shape[1], pair.Q.shape[1]
+        self.parted = parts_of(self.batch, n, m) > 1
 
-    def totals(self) -> Totals:
-        """Zeros, to be added to."""
-        return Totals.zero(len(self.packed.rows), self.packed.rows.shape[2], self.points.shape[2])
+    def walk(self, number: int, course: Course, trace: Trace) -> None:
+        """Take item ``number`` along all steps of the course."""
+        scene = self._item(number)
+        if not self.parted:
+            cpu_course.walk(scene, course, trace)
+            return
+        for step, temperature in enumerate(course.temperatures):
+            pose = trace.rotations[step], trace.translations[step]
+            cpu_course.look(scene, pose, temperature)
+            run_item(GRADIENT, scene.tables, scene.kept, self.loss, self.batch)
+            cpu_course.torque_and_force(scene.cloud, scene.tables.sums[1], pose, trace.gradients[step])
+            advance(course, trace, step)
 
-    def slope(self, at: Point, temperature: np.ndarray) -> np.ndarray:
-        """The loss's gradient by a further turn and shift of the pose, ``(batch, 6)``."""
-        arms, normals = self._place(at, temperature)
-        sums = run_sweeps(GRADIENT, self.packed, self.terms.outlier, self.terms.mean)
-        forces = sums.columns[:, :3]
-        outer = forces @ transposed(arms)
-        if normals is not None:
-            outer += sums.columns[:, 3:6] @ transposed(normals)
-        return np.concatenate((axial(outer), forces.sum(axis=2)), axis=1)
+    def walk_back(
+        self,
+        number: int,
+        course: Course,
+        trace: Trace,
+        out: tuple[Back, Adjoint],
+        by_course: tuple[np.ndarray, np.ndarray],
+    ) -> None:
+        """Take the cotangents of its last point back to the first; ``by_course`` gets the temperatures' and rates'."""
+        scene = self._item(number)
+        if not self.parted:
+            cpu_course.walk_back(scene, course, trace, out, by_course)
+            return
+        tables = scene.tables
+        for step in reversed(range(len(course.temperatures))):
+            along = retreat(course, trace, step, out[0], by_course[1])
+            pose, temperature = (trace.rotations[step], trace.translations[step]), course.temperatures[step]
+            cpu_course.look(scene, pose, temperature)
+            cpu_course.set_going(scene.cloud, tables.sides[1], tables.normals, pose, along)
+            run_item(DUAL, tables, scene.kept_rates, self.loss, self.batch)
+            heat = cpu_course.spread(scene.cloud, tables.sums, tables.shares, (pose, along), out)
+            by_course[0][step] = heat / temperature**2
 
-    def pull_back(
-        self, at: Point, temperature: np.ndarray, along: np.ndarray, totals: Totals
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cotangents of ``along . slope``, ``along (batch, 6)``: of rotation, translation and temperature.
+    def _item(self, number: int) -> cpu_course.Scene:
+        points = _channels(self.pair.Q[number])
+        normals = np.zeros_like(points) if self.pair.Q_normals is None else _channels(self.pair.Q_normals[number])
+        real = np.ones(points.shape[1], dtype=bool) if self.pair.Q_mask is None else self.pair.Q_mask[number].numpy()
+        tables = self.packed.item(number)
+        cloud = Cloud(points, normals, real, float(self.rounding[number]))
+        return cpu_course.Scene(cloud, tables, room_to_keep(GRADIENT, tables), room_to_keep(DUAL, tables), self.loss)
 
-        Those of the clouds are added to ``totals``.
-        """
-        arms, normals = self._place(at, temperature)
-        turning = hat(along[:, :3])
-        velocity = turning @ arms + along[:, 3:, None]
-        self.packed.columns[:, VELOCITY : VELOCITY + 3] = self._unpadded(velocity)
-        if normals is not None and self.packed.column_normals is not None:
-            self.packed.column_normals[:, 3:] = turning @ normals
-        sums = run_sweeps(DUAL, self.packed, self.terms.outlier, self.terms.mean)
-        rates = sums.columns[:, COLUMN_OUT:]
-        pull = self._unpadded(rates[:, :3] - turning @ sums.columns[:, :3])
-        rotation = pull @ transposed(self.points)
-        totals.Q[:] += transposed(at.rotation) @ pull
-        if self.normals is not None:
-            torque = self._unpadded(rates[:, 3:6] - turning @ sums.columns[:, 3:6])
-            rotation += torque @ transposed(self.normals)
-            totals.Q_normals[:] += transposed(at.rotation) @ torque
-        self._add(sums, totals)
-        heat = sums.rows[:, ROW_OUT + HEAT].sum(axis=1) / temperature**2
-        return rotation, self._unpadded(rates[:, :3]).sum(axis=2), heat
 
-    def _place(self, at: Point, temperature: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Put the source where the pose has it; its points about the translation, and its normals, turned."""
-        arms = at.rotation @ self.points
-        moved, normals = arms + at.translation[:, :, None], None
-        self.packed.columns[:, :3] = moved if self.padded is None else np.where(self.padded, -FAR, moved)
-        if self.normals is not None and self.packed.column_normals is not None:
-            normals = at.rotation @ self.normals
-            shown = normals if self.padded is None else np.where(self.padded, LONG_NORMAL, normals)
-            self.packed.column_normals[:, :3] = shown
-        self.packed.constants[:, COOL] = 1 / temperature
-        return arms, normals
-
-    def _add(self, sums: Sums, totals: Totals) -> None:
-        totals.P[:] += sums.rows[:, ROW_OUT : ROW_OUT + 3]
-        totals.P_normals[:] += sums.rows[:, ROW_OUT + 3 : ROW_OUT + HEAT]
-        totals.P_weights[:] += sums.row_shares[:, 1]
-        totals.Q_weights[:] += sums.column_shares[:, 1]
-        totals.rounding[:] += self.rounding * sums.rows[:, ROW_OUT + ROUND].sum(axis=1)
-
-    def _unpadded(self, vectors: np.ndarray) -> np.ndarray:
-        """Float64, and 0 where padded."""
-        return vectors.astype(np.float64) if self.padded is None else np.where(self.padded, 0.0, vectors)
+def _channels(vectors: Tensor) -> np.ndarray:
+    """``(n, d)`` as float64 channels ``(3, n)``."""
+    return np.ascontiguousarray(in_space(vectors.detach().double().numpy()).T)

@@ -1,13 +1,11 @@
-"""F on its mutual pairs, compiled, looked at from one pose after the other; formulas as in ``kernels/matched.py``."""
-
-from functools import partial
+"""F on its mutual pairs, compiled but for the search, and walked on; formulas as in ``kernels/matched.py``."""
 
 import numpy as np
 from torch import Tensor
 
-from bbr_layer.inner.adam_by_hand import Point, Totals
-from bbr_layer.kernels.cpu_batch import side_by_side
-from bbr_layer.kernels.cpu_matched import TANGENT, MatchedClouds, add_adjoint, add_weights, slope_of
+from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
+from bbr_layer.kernels.cpu_course import Adjoint
+from bbr_layer.kernels.cpu_matched import MatchedClouds, add_adjoint, add_weights, slope_of
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.pair import CloudPair
 from bbr_layer.trees import in_space
@@ -31,43 +29,30 @@ class MatchedScene:
             tables.append(np.ones(points.shape[:2]) if weights is None else weights.detach().double().numpy())
         self.clouds = [MatchedClouds(*map(np.ascontiguousarray, item)) for item in zip(*tables, strict=True)]
 
-    def totals(self) -> Totals:
-        """Zeros, to be added to."""
-        return Totals.zero(len(self.clouds), len(self.clouds[0].P), len(self.clouds[0].Q))
+    def walk(self, number: int, course: Course, trace: Trace) -> None:
+        """Take item ``number`` along all steps of the course."""
+        clouds = self.clouds[number]
+        for step, temperature in enumerate(course.temperatures):
+            pose = trace.rotations[step], trace.translations[step]
+            trace.gradients[step] = slope_of(clouds, self.search.of_item(number, pose), pose, temperature)
+            advance(course, trace, step)
 
-    def slope(self, at: Point, temperature: np.ndarray) -> np.ndarray:
-        """The loss's gradient by a further turn and shift of the pose, ``(batch, 6)``."""
-        slopes = np.zeros((len(self.clouds), TANGENT))
-        side_by_side(partial(self._slope, at, temperature, slopes), len(self.clouds))
-        return slopes
-
-    def pull_back(
-        self, at: Point, temperature: np.ndarray, along: np.ndarray, totals: Totals
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cotangents of ``along . slope``: of rotation, translation and temperature; the clouds' go to ``totals``."""
-        found = np.zeros_like(at.rotation), np.zeros_like(at.translation), np.zeros(len(self.clouds))
-        side_by_side(partial(self._pull_back, at, (temperature, along), totals, found), len(self.clouds))
-        return found
-
-    def _slope(self, at: Point, temperature: np.ndarray, slopes: np.ndarray, b: int) -> None:
-        pose = _pose(at, b)
-        slopes[b] = slope_of(self.clouds[b], self.search.of_item(b, pose), pose, temperature[b])
-
-    def _pull_back(
+    def walk_back(
         self,
-        at: Point,
-        heated: tuple[np.ndarray, np.ndarray],
-        totals: Totals,
-        found: tuple[np.ndarray, np.ndarray, np.ndarray],
-        b: int,
+        number: int,
+        course: Course,
+        trace: Trace,
+        out: tuple[Back, Adjoint],
+        by_course: tuple[np.ndarray, np.ndarray],
     ) -> None:
-        clouds, pose, (temperature, along) = self.clouds[b], _pose(at, b), heated
-        pairs = self.search.of_item(b, pose)
-        fields = totals.P, totals.Q, totals.P_normals, totals.Q_normals
-        out = found[0][b], found[1][b], *(field[b] for field in fields)
-        found[2][b], rates = add_adjoint(clouds, pairs, pose, (temperature[b], along[b]), out)
-        add_weights(clouds, pairs, rates, totals.P_weights[b], totals.Q_weights[b])
-
-
-def _pose(at: Point, b: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.ascontiguousarray(at.rotation[b]), np.ascontiguousarray(at.translation[b])
+        """Take the cotangents of its last point back to the first; ``by_course`` gets the temperatures' and rates'."""
+        clouds, (back, adjoint) = self.clouds[number], out
+        by_clouds = adjoint.P, adjoint.Q, adjoint.P_normals, adjoint.Q_normals
+        for step in reversed(range(len(course.temperatures))):
+            along = retreat(course, trace, step, back, by_course[1])
+            pose, temperature = (trace.rotations[step], trace.translations[step]), course.temperatures[step]
+            pairs = self.search.of_item(number, pose)
+            by_pose = back.rotation, back.translation
+            heat, rates = add_adjoint(clouds, pairs, pose, (temperature, along), (*by_pose, *by_clouds))
+            add_weights(clouds, pairs, rates, adjoint.P_weights, adjoint.Q_weights)
+            by_course[0][step] = heat

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,13 +13,15 @@ from bbr_layer.inner.adam import Moments
 from bbr_layer.inner.charts import RotationVector, State
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.unroll import Problem, Progress, begin, detached, floor, share_done, step
-from bbr_layer.inner.walk import Scene, Steps, walk
 from bbr_layer.kernels import scene as kernel_scene
 from bbr_layer.kernels.choice import backend, sweeps_for
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.soft import SoftKernel
 from bbr_layer.pair import CloudPair
 from bbr_layer.rotations import rotation_dimensions
+
+if TYPE_CHECKING:
+    from bbr_layer.inner.walk import Scene
 
 # Share of the steps, at the end, over which a registration must have settled to count as converged.
 SETTLED_TAIL = 0.1
@@ -61,7 +64,7 @@ def _advance(problem: Problem, at: Progress, steps: int, differentiable: bool) -
     return at
 
 
-def _look(problem: Problem) -> Callable[[CloudPair, Tensor], Scene] | None:
+def _look(problem: Problem) -> "Callable[[CloudPair, Tensor], Scene] | None":
     """What walks the steps without a tensor in between; None where nothing can."""
     loss, inner = problem.loss, problem.inner
     if not isinstance(loss, PairKernel) or loss.pair.P.device.type != "cpu":
@@ -82,7 +85,9 @@ def _look(problem: Problem) -> Callable[[CloudPair, Tensor], Scene] | None:
     return None
 
 
-def _walked(problem: Problem, look: Callable[[CloudPair, Tensor], Scene], at: Progress, steps: int) -> Progress:
+def _walked(problem: Problem, look: "Callable[[CloudPair, Tensor], Scene]", at: Progress, steps: int) -> Progress:
+    from bbr_layer.inner.walk import Steps, walk
+
     loss, inner, done, d = problem.loss, problem.inner, at.moments.step, at.state.translation.shape[-1]
     assert isinstance(loss, PairKernel)
     shares = [share_done(number, inner.steps) for number in range(done, done + steps)]

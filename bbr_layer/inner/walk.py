@@ -1,34 +1,43 @@
-"""Many steps of the unroll as one node of the graph.
+"""Many steps of the unroll as one node of the graph, item by item on plain threads.
 
-The clouds are packed once, and nothing between the steps is a tensor. Backward walks the steps in reverse; each asks
-for one directional derivative of the loss's gradient.
+Nothing between the steps is a tensor. Backward walks the steps in reverse; each asks for one directional derivative of
+the loss's gradient.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bbr_layer.inner.adam import Adam
-from bbr_layer.inner.adam_by_hand import HandAdam, Point, Taken, Totals
 from bbr_layer.inner.once import once
+from bbr_layer.kernels.cpu_adam import Back, Course, Trace
+from bbr_layer.kernels.cpu_course import Adjoint
+from bbr_layer.kernels.cpu_threads import side_by_side
 from bbr_layer.pair import CloudPair
 from bbr_layer.trees import in_space
 
+# The components of a tangent in space that are free, rotation first.
+AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
 
-@runtime_checkable
+Tables = TypeVar("Tables", Trace, Back, Adjoint)
+
+
 class Scene(Protocol):
-    """A pair of clouds under one loss, looked at from one pose after the other; see ``CompiledScene``."""
+    """A batch of pairs of clouds under one loss; see ``CompiledScene``."""
 
-    def totals(self) -> Totals: ...
+    def walk(self, number: int, course: Course, trace: Trace) -> None: ...
 
-    def slope(self, at: Point, temperature: np.ndarray) -> np.ndarray: ...
-
-    def pull_back(
-        self, at: Point, temperature: np.ndarray, along: np.ndarray, totals: Totals
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+    def walk_back(
+        self,
+        number: int,
+        course: Course,
+        trace: Trace,
+        out: tuple[Back, Adjoint],
+        by_course: tuple[np.ndarray, np.ndarray],
+    ) -> None: ...
 
 
 class Steps(NamedTuple):
@@ -44,6 +53,14 @@ class Steps(NamedTuple):
     look: Callable[[CloudPair, Tensor], Scene]
     inner: Adam
     done: int
+
+    def course(self, temperatures: Tensor, rates: Tensor, dimension: int) -> Callable[[int], Course]:
+        """How each item goes, from ``(steps, batch)`` and ``(steps, k)``."""
+        free, axes = np.zeros(6), AXES[dimension]
+        free[axes] = 1
+        heats, constants = np.ascontiguousarray(temperatures.numpy().T), (*self.inner.betas, self.inner.eps)
+        speeds = _spread(rates, axes)
+        return lambda b: Course(heats[b], speeds, free, constants, self.inner.shared, self.done)
 
 
 class Walked(NamedTuple):
@@ -77,20 +94,15 @@ class _Walk(torch.autograd.Function):
     def forward(ctx: Any, steps: Steps, *given: Any) -> tuple[Tensor, ...]:
         rounding, temperatures, rates, rotation, translation, first, second, *fields = given
         pair, d = CloudPair._make(fields), translation.shape[-1]
-        scene, adam = steps.look(pair, rounding), HandAdam(steps.inner, d)
-        at = Point(_embedded(rotation, 1.0), in_space(translation.numpy()), first.numpy(), second.numpy())
-        points, gradients = [at], []
-        for number, (temperature, rate) in enumerate(zip(temperatures.numpy(), rates.numpy(), strict=True)):
-            gradient = scene.slope(at, temperature)[:, adam.axes]
-            at = adam.advance(at, gradient, rate, steps.done + number + 1)
-            points.append(at)
-            gradients.append(gradient)
-        ctx.steps, ctx.points, ctx.gradients = steps, points, gradients
+        scene, course = steps.look(pair, rounding), steps.course(temperatures, rates, d)
+        trace = _begun(len(temperatures), rotation, translation, first, second)
+        side_by_side(lambda b: scene.walk(b, course(b), _item(trace, b)), len(translation))
+        ctx.steps, ctx.trace = steps, trace
         ctx.save_for_backward(*given)
-        norm = torch.from_numpy(np.linalg.norm(gradients[-1], axis=1))
+        norm = torch.from_numpy(np.linalg.norm(trace.gradients[:, -1], axis=1))
         ctx.mark_non_differentiable(norm)
-        tables = at.rotation[:, :d, :d], at.translation[:, :d], at.first, at.second
-        return *(torch.from_numpy(np.ascontiguousarray(table)) for table in tables), norm
+        ends = trace.rotations[:, -1], trace.translations[:, -1], trace.firsts[:, -1], trace.seconds[:, -1]
+        return *_free(Back(*ends), d), norm
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Any, ...]:
@@ -101,41 +113,76 @@ class _Walk(torch.autograd.Function):
     @staticmethod
     def pulled_back(ctx: Any, cotangents: tuple[Tensor, ...]) -> list[Tensor | None]:
         """Cotangents of everything that is saved, in order."""
-        rounding, temperatures, rates, rotation, translation, _, _, *fields = ctx.saved_tensors
+        rounding, temperatures, rates, _, translation, _, _, *fields = ctx.saved_tensors
         pair, d, steps = CloudPair._make(fields), translation.shape[-1], ctx.steps
-        scene, adam = steps.look(pair, rounding), HandAdam(steps.inner, d)
-        totals, heats, speeds = scene.totals(), np.zeros(temperatures.shape), np.zeros(rates.shape)
-        by_translation, *by_moments = (x.numpy() for x in cotangents[1:4])
-        back = Point(_embedded(cotangents[0], 0.0), in_space(by_translation), *by_moments)
-        for number in reversed(range(len(heats))):
-            before, taken = ctx.points[number], Taken(ctx.gradients[number], ctx.points[number + 1])
-            rate, count = rates[number].numpy(), steps.done + number + 1
-            back, by_gradient, by_rate = adam.retreat(taken, back, rate, count)
-            along = np.zeros((len(by_gradient), 6))
-            along[:, adam.axes] = by_gradient
-            turn, shift, heats[number] = scene.pull_back(before, temperatures[number].numpy(), along, totals)
-            back = back._replace(rotation=back.rotation + turn, translation=back.translation + shift)
-            speeds[number] = by_rate.sum(axis=0)
-        pose = back.rotation[:, :d, :d], back.translation[:, :d], back.first, back.second
-        by_pose = [torch.from_numpy(np.ascontiguousarray(x)) for x in pose]
-        by_lengths = [torch.from_numpy(x) for x in (totals.rounding, heats, speeds)]
-        by_fields = [_as_field(totals, name, getattr(pair, name)) for name in CloudPair._fields]
-        return [*by_lengths, *by_pose, *by_fields]
+        scene, course = steps.look(pair, rounding), steps.course(temperatures, rates, d)
+        (count, batch), axes = temperatures.shape, AXES[d]
+        adjoint = _zero(batch, pair.P.shape[1], pair.Q.shape[1])
+        moments = (_spread(x, axes) for x in cotangents[2:4])
+        back = Back(_in_space(cotangents[0], 0.0), in_space(cotangents[1].numpy()).copy(), *moments)
+        heats, speeds = np.zeros((batch, count)), np.zeros((batch, count, 6))
+
+        def work(b: int) -> None:
+            scene.walk_back(
+                b, course(b), _item(ctx.trace, b), (_item(back, b), _item(adjoint, b)), (heats[b], speeds[b])
+            )
+
+        side_by_side(work, batch)
+        lengths = adjoint.rounding[:, 0], heats.T, speeds.sum(axis=0)[:, axes]
+        by_lengths = [torch.from_numpy(np.ascontiguousarray(x)) for x in lengths]
+        by_fields = [_as_field(adjoint, name, getattr(pair, name)) for name in CloudPair._fields]
+        return [*by_lengths, *_free(back, d), *by_fields]
 
 
-def _as_field(totals: Any, name: str, field: Tensor | None) -> Tensor | None:
-    """The cotangent of a field of the pair, in its shape; None for what has none."""
-    if field is None or not hasattr(totals, name):
-        return None
-    table = torch.from_numpy(getattr(totals, name))
-    return (table if field.ndim == 2 else table[:, : field.shape[-1]].mT).to(field.dtype)
+def _begun(steps: int, rotation: Tensor, translation: Tensor, first: Tensor, second: Tensor) -> Trace:
+    """A batch of traces with room for all steps, at their first point."""
+    batch, axes = len(translation), AXES[translation.shape[-1]]
+    shapes = (steps + 1, 3, 3), (steps + 1, 3), (steps + 1, 6), (steps + 1, 6), (steps, 6)
+    trace = Trace(*(np.zeros((batch, *shape)) for shape in shapes))
+    starts = _in_space(rotation, 1.0), in_space(translation.numpy()), _spread(first, axes), _spread(second, axes)
+    for table, values in zip(trace, starts, strict=False):
+        table[:, 0] = values
+    return trace
 
 
-def _embedded(rotation: Tensor, last: float) -> np.ndarray:
-    """Matrices of the plane in space, with ``last`` on the third axis."""
-    matrices = rotation.numpy()
-    if matrices.shape[-1] == 3:
-        return matrices
-    whole = np.zeros((len(matrices), 3, 3))
-    whole[:, :2, :2], whole[:, 2, 2] = matrices, last
+def _zero(batch: int, n: int, m: int) -> Adjoint:
+    vectors, numbers = ((batch, 3, n), (batch, 3, m)), ((batch, n), (batch, m))
+    return Adjoint(*(np.zeros(shape) for shape in (*vectors, *vectors, *numbers, (batch, 1))))
+
+
+def _item(tables: Tables, number: int) -> Tables:
+    """The same of one item of a batch."""
+    return type(tables)(*(table[number] for table in tables))
+
+
+def _free(point: Back, d: int) -> list[Tensor]:
+    """A point in the space of the data, without what is not free."""
+    axes = AXES[d]
+    tables = point.rotation[:, :d, :d], point.translation[:, :d], point.first[:, axes], point.second[:, axes]
+    return [torch.from_numpy(np.ascontiguousarray(table)) for table in tables]
+
+
+def _spread(values: Tensor, axes: list[int]) -> np.ndarray:
+    """Free components ``(rows, k)`` in six columns."""
+    whole = np.zeros((len(values), 6))
+    whole[:, axes] = values.numpy()
     return whole
+
+
+def _in_space(rotation: Tensor, last: float) -> np.ndarray:
+    """Matrices of the plane in space, with ``last`` on the third axis; a copy."""
+    matrices = rotation.numpy()
+    whole = np.zeros((len(matrices), 3, 3))
+    d = matrices.shape[-1]
+    whole[:, :d, :d] = matrices
+    if d == 2:
+        whole[:, 2, 2] = last
+    return whole
+
+
+def _as_field(adjoint: Adjoint, name: str, field: Tensor | None) -> Tensor | None:
+    """The cotangent of a field of the pair, in its shape; None for what has none."""
+    if field is None or not hasattr(adjoint, name):
+        return None
+    table = torch.from_numpy(getattr(adjoint, name))
+    return (table if field.ndim == 2 else table[:, : field.shape[-1]].mT).to(field.dtype)

@@ -4,7 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Packed, Sums, run_sweeps
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Packed, room_for_sums, run_sweeps
+from bbr_layer.kernels.cpu_items import Loss
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHANNELS,
@@ -38,14 +39,16 @@ def supports(terms: SoftTerms, scene: Scene) -> bool:
 
 def gradient(terms: SoftTerms, scene: Scene) -> tuple[Tensor, Scene]:
     """As ``reference.soft_gradient``."""
-    sums = run_sweeps(GRADIENT, pack(terms, scene), terms.outlier, terms.mean)
-    return torch.from_numpy(sums.losses), _unpacked(scene, sums, 0)
+    packed = pack(terms, scene)
+    losses = run_sweeps(GRADIENT, packed, Loss(terms.outlier, terms.mean))
+    return torch.from_numpy(losses), _unpacked(scene, packed, 0)
 
 
 def directional(terms: SoftTerms, scene: Scene, direction: Direction) -> tuple[Scene, Scene]:
     """As ``reference.soft_directional``."""
-    sums = run_sweeps(DUAL, pack(terms, scene, direction), terms.outlier, terms.mean)
-    gradient, rates = _unpacked(scene, sums, 0), _unpacked(scene, sums, 1)
+    packed = pack(terms, scene, direction)
+    run_sweeps(DUAL, packed, Loss(terms.outlier, terms.mean))
+    gradient, rates = _unpacked(scene, packed, 0), _unpacked(scene, packed, 1)
     # The derivative by the temperature has alpha^2 below it, which changes too.
     cooling = 2 * gradient.temperature * direction.temperature / scene.temperature
     return gradient, rates._replace(temperature=rates.temperature - cooling)
@@ -58,19 +61,20 @@ def pack(terms: SoftTerms, scene: Scene, direction: Direction | None = None) -> 
     columns = _side(pair.Q, pair.Q_weights, pair.Q_mask, COLUMN_CHANNELS)
     if direction is not None:
         _put(columns, VELOCITY, direction.Q)
-    row_normals, column_normals = None, None
+    normals = None
     if terms.planes:
         P_normals, Q_normals = pair.both_normals()
-        row_normals, column_normals = _normals(P_normals, pair.P_mask, 3), _normals(Q_normals, pair.Q_mask, 6)
+        normals = _normals(P_normals, pair.P_mask, 3), _normals(Q_normals, pair.Q_mask, 6)
         if direction is not None and direction.Q_normals is not None:
-            _put(column_normals, 3, direction.Q_normals)
+            _put(normals[1], 3, direction.Q_normals)
     constants = np.zeros((len(rows), CONSTANTS), dtype=rows.dtype)
     constants[:, SMOOTH] = scene.rounding.detach().numpy() ** 2
     constants[:, COOL] = 1 / scene.temperature.detach().numpy()
     constants[:, ALIGN] = float(terms.align_signs)
     if direction is not None:
         constants[:, COOL_RATE] = (direction.temperature / scene.temperature).detach().numpy()
-    return Packed(rows, columns, row_normals, column_normals, constants)
+    room = room_for_sums(len(rows), rows.shape[2], columns.shape[2])
+    return Packed((rows, columns), normals, *room, constants)
 
 
 def _side(points: Tensor, weights: Tensor | None, mask: Tensor | None, channels: int) -> np.ndarray:
@@ -99,17 +103,19 @@ def _put(side: np.ndarray, channel: int, vectors: Tensor) -> None:
     side[:, channel : channel + vectors.shape[-1]] = vectors.detach().numpy().transpose(0, 2, 1)
 
 
-def _unpacked(scene: Scene, sums: Sums, order: int) -> Scene:
+def _unpacked(scene: Scene, packed: Packed, order: int) -> Scene:
     """The gradient (order 0) or, but for the temperature's own change, its rates (1)."""
-    rows, columns, pair = sums.rows[:, ROW_OUT * order :], sums.columns[:, COLUMN_OUT * order :], scene.pair
+    rows, columns = packed.sums[0][:, ROW_OUT * order :], packed.sums[1][:, COLUMN_OUT * order :]
+    by_row, by_column = (shares[:, order] for shares in packed.shares)
+    pair = scene.pair
     with_normals = pair.P_normals is not None and pair.Q_normals is not None
     fields = CloudPair(
         P=_field(rows, 0, pair.P, pair.P_mask),
         Q=_field(columns, 0, pair.Q, pair.Q_mask),
         P_normals=_field(rows, 3, pair.P, pair.P_mask) if with_normals else None,
         Q_normals=_field(columns, 3, pair.Q, pair.Q_mask) if with_normals else None,
-        P_weights=None if pair.P_weights is None else _share(sums.row_shares[:, order], pair.P_weights, pair.P_mask),
-        Q_weights=None if pair.Q_weights is None else _share(sums.column_shares[:, order], pair.Q_weights, pair.Q_mask),
+        P_weights=None if pair.P_weights is None else _share(by_row, pair.P_weights, pair.P_mask),
+        Q_weights=None if pair.Q_weights is None else _share(by_column, pair.Q_weights, pair.Q_mask),
     )
     heat, rounding = (torch.from_numpy(rows[:, k].sum(-1)) for k in (HEAT, ROUND))
     return Scene(fields, heat / scene.temperature.square(), scene.rounding * rounding)

@@ -1,159 +1,130 @@
 """The compiled sweeps over a batch: one item after the other or side by side, the rows of a large one in parts.
 
-The sweeps let go of Python's lock, so that plain threads run them. How the work is cut depends on the shapes alone,
-and parts are added up in order: the answer does not depend on the number of threads.
+How the work is cut depends on the shapes alone, and parts are added up in order: the answer does not depend on the
+number of threads.
 """
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
-from bbr_layer.kernels.cpu_dual_forces import point_force_rates
-from bbr_layer.kernels.cpu_dual_planes import plane_force_rates
-from bbr_layer.kernels.cpu_items import invert, settle_loss, settle_shares
-from bbr_layer.kernels.cpu_math import COLUMN_OUT, ROW_OUT
-from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators, plane_forces, point_forces
+from bbr_layer.kernels.cpu_dual_planes import force_rates
+from bbr_layer.kernels.cpu_forces import forces
+from bbr_layer.kernels.cpu_items import (
+    Both,
+    Loss,
+    Tables,
+    item_gradient,
+    item_rates,
+    settle_buddies,
+    settle_denominators,
+)
+from bbr_layer.kernels.cpu_math import COLUMN_OUT, KEPT_PAIRS, ROW_OUT
+from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators
+from bbr_layer.kernels.cpu_threads import side_by_side
 
 # A single item is cut into at most this many parts, of at least this many pairs each.
 MOST_PARTS, PAIRS_PER_PART = 8, 2**17
 
+Kept = tuple[np.ndarray, ...] | None
+
 
 class Sweeps(NamedTuple):
-    """The three sweeps for point-to-point and for point-to-plane distances, and how many channels they fill."""
+    """The three sweeps, the three of one item in one call, and whether rates are asked for.
 
-    points: tuple[Callable, Callable, Callable]
-    planes: tuple[Callable, Callable, Callable]
-    orders: int  # 1: values; 2: values and their rates
+    Parameters
+    ----------
+    kept: how many numbers of a pair are kept from the first sweep for the others, for points and for planes.
+    """
+
+    parts: tuple[Callable, Callable, Callable]
+    whole: Callable
+    rates: bool
+    kept: tuple[int, int]
 
 
-GRADIENT = Sweeps((denominators, buddy_sums, point_forces), (denominators, buddy_sums, plane_forces), 1)
-DUAL = Sweeps(
-    (denominator_rates, buddy_sum_rates, point_force_rates),
-    (denominator_rates, buddy_sum_rates, plane_force_rates),
-    2,
-)
+GRADIENT = Sweeps((denominators, buddy_sums, forces), item_gradient, False, (2, 2))
+# For planes, loading what was kept is no faster than computing it again (measured at 500 and 1000 points).
+DUAL = Sweeps((denominator_rates, buddy_sum_rates, force_rates), item_rates, True, (3, 0))
 
 
 class Packed(NamedTuple):
-    """A batch as the sweeps read it; see ``cpu_math`` for channels and constants.
+    """A batch of ``Tables``: the same fields with the batch before them."""
 
-    Parameters
-    ----------
-    rows, columns: ``(b, channels, n)`` and ``(b, channels, m)``.
-    row_normals, column_normals: ``(b, 3, n)`` and ``(b, 6, m)``, or None.
-    constants: ``(b, c)``.
-    """
-
-    rows: np.ndarray
-    columns: np.ndarray
-    row_normals: np.ndarray | None
-    column_normals: np.ndarray | None
+    sides: Both
+    normals: Both | None
+    sums: Both
+    shares: Both
     constants: np.ndarray
 
-
-class Sums(NamedTuple):
-    """What the sweeps answer, float64: values, and behind them their rates if they were asked for.
-
-    Parameters
-    ----------
-    losses: ``(b,)``.
-    rows, columns: ``(b, 8 or 16, n)`` and ``(b, 6 or 12, m)``, as ``point_forces`` and its kin fill them.
-    row_shares, column_shares: ``(b, 1 or 2, n)`` and ``(b, 1 or 2, m)``: the loss per unit of weight of each point.
-    """
-
-    losses: np.ndarray
-    rows: np.ndarray
-    columns: np.ndarray
-    row_shares: np.ndarray
-    column_shares: np.ndarray
+    def item(self, b: int) -> Tables:
+        """Item ``b``."""
+        sides, sums, shares = ((x[0][b], x[1][b]) for x in (self.sides, self.sums, self.shares))
+        normals = None if self.normals is None else (self.normals[0][b], self.normals[1][b])
+        return Tables(sides, normals, sums, shares, self.constants[b])
 
 
-def run_sweeps(sweeps: Sweeps, packed: Packed, outlier: float, mean: bool) -> Sums:
-    """Loss and gradient of every item; inverse denominators and shares are left in ``packed``."""
-    (batch, _, n), m, orders = packed.rows.shape, packed.columns.shape[2], sweeps.orders
-    sums = Sums(
-        np.zeros(batch),
-        np.zeros((batch, ROW_OUT * orders, n)),
-        np.zeros((batch, COLUMN_OUT * orders, m)),
-        np.zeros((batch, orders, n)),
-        np.zeros((batch, orders, m)),
-    )
-    parts = max(1, min(MOST_PARTS, n * m // PAIRS_PER_PART)) if batch == 1 else 1
-
-    side_by_side(partial(_item, sweeps, packed, sums, (parts, outlier, mean)), batch)
-    return sums
+def room_for_sums(batch: int, n: int, m: int) -> tuple[Both, Both]:
+    """Zeros for sums and for shares."""
+    sums = np.zeros((batch, 2 * ROW_OUT, n)), np.zeros((batch, 2 * COLUMN_OUT, m))
+    return sums, (np.zeros((batch, 2, n)), np.zeros((batch, 2, m)))
 
 
-def _item(sweeps: Sweeps, packed: Packed, sums: Sums, settings: tuple[int, float, bool], b: int) -> None:
-    """All three sweeps over item ``b``; ``settings`` are the parts, the epsilon, and whether the loss is a mean."""
-    rows, columns, constants, rates = packed.rows[b], packed.columns[b], packed.constants[b], sweeps.orders > 1
-    parts, outlier, mean = settings
-    _sweep(sweeps, 0, packed, (b, parts), sums)
-    invert(rows, sums.rows[b], outlier, rates)
-    invert(columns, sums.columns[b], outlier, rates)
-    _sweep(sweeps, 1, packed, (b, parts), sums)
-    sums.losses[b] = settle_loss(rows, sums.rows[b], constants, mean, rates)
-    settle_shares(rows, sums.rows[b], constants, sums.row_shares[b], rates)
-    settle_shares(columns, sums.columns[b], constants, sums.column_shares[b], rates)
-    _sweep(sweeps, 2, packed, (b, parts), sums)
+def room_to_keep(sweeps: Sweeps, tables: Tables) -> Kept:
+    """What the first sweep of an item may keep for the others; None where that is nothing, or would be too much."""
+    rows, columns = tables.sides
+    count = sweeps.kept[tables.normals is not None]
+    if not count or rows.shape[1] * columns.shape[1] > KEPT_PAIRS:
+        return None
+    return tuple(np.empty((rows.shape[1], columns.shape[1]), rows.dtype) for _ in range(count))
 
 
-def _sweep(sweeps: Sweeps, which: int, packed: Packed, cut: tuple[int, int], sums: Sums) -> None:
-    """Sweep ``which`` over item ``cut[0]`` in ``cut[1]`` parts of its rows."""
-    (b, parts), n = cut, packed.rows.shape[2]
-    row_out, column_out = sums.rows[b], sums.columns[b]
-    row_out[:], column_out[:] = 0, 0
-    partial_sums = column_out[None] if parts == 1 else np.zeros((parts, *column_out.shape))
-    spans = [slice(n * number // parts, n * (number + 1) // parts) for number in range(parts)]
-    tables = row_out, partial_sums, spans
+def parts_of(batch: int, n: int, m: int) -> int:
+    """Into how many parts the rows of an item are cut."""
+    return max(1, min(MOST_PARTS, n * m // PAIRS_PER_PART)) if batch == 1 else 1
+
+
+def run_sweeps(sweeps: Sweeps, packed: Packed, loss: Loss) -> np.ndarray:
+    """Losses of all items, ``(batch,)``; their gradients and, if asked, rates are left in ``packed``."""
+    losses = np.zeros(len(packed.constants))
+
+    def work(b: int) -> None:
+        tables = packed.item(b)
+        losses[b] = run_item(sweeps, tables, room_to_keep(sweeps, tables), loss, len(losses))
+
+    side_by_side(work, len(losses))
+    return losses
+
+
+def run_item(sweeps: Sweeps, tables: Tables, kept: Kept, loss: Loss, batch: int) -> float:
+    """The loss of one item of a batch of so many; what else is found is left in the tables."""
+    n, m = (side.shape[1] for side in tables.sides)
+    parts = parts_of(batch, n, m)
     if parts == 1:
-        _part(sweeps, (which, b), packed, tables, 0)
-    else:
-        side_by_side(partial(_part, sweeps, (which, b), packed, tables), parts)
-        column_out += partial_sums.sum(0)
+        return sweeps.whole(tables, kept, loss)
+    spans = [slice(n * number // parts, n * (number + 1) // parts) for number in range(parts)]
+    _in_parts(sweeps.parts[0], tables, kept, spans)
+    settle_denominators(tables, loss, sweeps.rates)
+    _in_parts(sweeps.parts[1], tables, kept, spans)
+    value = settle_buddies(tables, loss, sweeps.rates)
+    _in_parts(sweeps.parts[2], tables, kept, spans)
+    return value
 
 
-def _part(
-    sweeps: Sweeps,
-    which: tuple[int, int],
-    packed: Packed,
-    tables: tuple[np.ndarray, np.ndarray, list[slice]],
-    number: int,
-) -> None:
-    """Part ``number`` of sweep ``which[0]`` over item ``which[1]``."""
-    (sweep, b), (row_out, partial_sums, spans) = which, tables
-    span, columns, out = spans[number], packed.columns[b], (row_out[:, spans[number]], partial_sums[number])
-    if packed.row_normals is None or packed.column_normals is None:
-        sweeps.points[sweep](packed.rows[b][:, span], columns, None, out, packed.constants[b])
-    else:
-        normals = packed.row_normals[b][:, span], packed.column_normals[b]
-        sweeps.planes[sweep](packed.rows[b][:, span], columns, normals, out, packed.constants[b])
+def _in_parts(sweep: Callable, tables: Tables, kept: Kept, spans: list[slice]) -> None:
+    row_sums, column_sums = tables.sums
+    row_sums[:] = 0
+    partial_sums = np.zeros((len(spans), *column_sums.shape))
+    side_by_side(partial(_part, sweep, tables, kept, (spans, partial_sums)), len(spans))
+    column_sums[:] = partial_sums.sum(0)
 
 
-def side_by_side(work: Callable[[int], None], count: int) -> None:
-    """``work(0)`` to ``work(count - 1)`` on as many threads as torch is set to."""
-    threads = min(torch.get_num_threads(), count)
-    if threads == 1:
-        for number in range(count):
-            work(number)
-    else:
-        for done in _pool(threads).map(work, range(count)):
-            assert done is None
-
-
-_POOLS: dict[int, ThreadPoolExecutor] = {}
-
-
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return _POOLS.setdefault(threads, ThreadPoolExecutor(threads, thread_name_prefix="bbr_layer"))
-
-
-# A forked process (a worker of a data loader) has none of its parent's threads.
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_POOLS.clear)
+def _part(sweep: Callable, tables: Tables, kept: Kept, cut: tuple[list[slice], np.ndarray], number: int) -> None:
+    (rows, columns), normals, span = tables.sides, tables.normals, cut[0][number]
+    shown = None if normals is None else (normals[0][:, span], normals[1])
+    out = tables.sums[0][:, span], cut[1][number]
+    own = None if kept is None else tuple(table[span] for table in kept)
+    sweep((rows[:, span], columns), shown, out, tables.constants, own)

@@ -1,7 +1,7 @@
 """The sweeps of ``cpu_sweeps`` in dual numbers: rates of change as the columns, their normals and alpha change.
 
-Arguments as there; columns also hold velocities, the columns' normals theirs in channels 3 to 5, and everything summed
-has its rate of change behind it.
+Arguments as there; columns also hold velocities, the columns' normals theirs in channels 3 to 5, everything summed has
+its rate of change behind it, and what is kept goes on with the rates of the distances.
 """
 
 import numpy as np
@@ -20,24 +20,26 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
-    exp_negative,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
     add_three,
     add_up,
+    dot,
+    kept_row,
     logit_rate,
-    plane_distance,
-    point_distance,
+    measured_rate,
+    plane_square_rate,
     point_of,
     three,
 )
 
 
 @compiled()
-def denominator_rates(rows, columns, normals, out, constants):  # type: ignore[no-untyped-def]
+def denominator_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """Sums of exp(-D / alpha) and their rates: channels 0 and 1 of both ``out``."""
-    smooth, cool, align, cool_rate = constants[SMOOTH], constants[COOL], constants[ALIGN], constants[COOL_RATE]
+    rows, columns = sides
+    scales, align, cool_rate = (constants[SMOOTH], constants[COOL]), constants[ALIGN], constants[COOL_RATE]
     sums = np.empty((2, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -53,15 +55,18 @@ def denominator_rates(rows, columns, normals, out, constants):  # type: ignore[n
                 if normals is not None:
                     normal = point_of(normals[0], i)
                 row = row_rate = px * ZERO
+                seen = kept_row(kept, i, first, last)
                 for j in range(qx.size):
                     offset, velocity = (qx[j] - px, qy[j] - py, qz[j] - pz), (vx[j], vy[j], vz[j])
                     if normals is None:
-                        distance, distance_rate = point_distance(offset, velocity, smooth)
+                        squared, half_rate = dot(offset, offset), dot(offset, velocity)
                     else:
                         around = normal, (nx[j], ny[j], nz[j]), (mx[j], my[j], mz[j])
-                        distance, distance_rate = plane_distance((offset, velocity), around, smooth, align)
-                    e = exp_negative(-distance * cool)
-                    e_rate = e * logit_rate(distance, distance_rate, cool, cool_rate)
+                        squared, half_rate = plane_square_rate((offset, velocity), around, align)
+                    e, distance, _, distance_rate = measured_rate(None, j, squared, half_rate, scales)
+                    if kept is not None:
+                        seen[0][j], seen[1][j], seen[2][j] = e, distance, distance_rate
+                    e_rate = e * logit_rate(distance, distance_rate, scales[1], cool_rate)
                     row += e
                     row_rate += e_rate
                     total[j] += e
@@ -78,9 +83,10 @@ def weights_of(rows, i):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def buddy_sum_rates(rows, columns, normals, out, constants):  # type: ignore[no-untyped-def]
+def buddy_sum_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """Sums of buddies and of buddies times distance, and the rates of the two: channels 0 to 3 of both ``out``."""
-    smooth, cool, align, cool_rate = constants[SMOOTH], constants[COOL], constants[ALIGN], constants[COOL_RATE]
+    rows, columns = sides
+    scales, align, cool_rate = (constants[SMOOTH], constants[COOL]), constants[ALIGN], constants[COOL_RATE]
     sums = np.empty((4, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -98,16 +104,17 @@ def buddy_sum_rates(rows, columns, normals, out, constants):  # type: ignore[no-
                 if normals is not None:
                     normal = point_of(normals[0], i)
                 a = b = a_rate = b_rate = px * ZERO
+                seen = kept_row(kept, i, first, last)
                 for j in range(qx.size):
                     offset, velocity = (qx[j] - px, qy[j] - py, qz[j] - pz), (vx[j], vy[j], vz[j])
                     if normals is None:
-                        distance, distance_rate = point_distance(offset, velocity, smooth)
+                        squared, half_rate = dot(offset, offset), dot(offset, velocity)
                     else:
                         around = normal, (nx[j], ny[j], nz[j]), (mx[j], my[j], mz[j])
-                        distance, distance_rate = plane_distance((offset, velocity), around, smooth, align)
-                    e = exp_negative(-distance * cool)
+                        squared, half_rate = plane_square_rate((offset, velocity), around, align)
+                    e, distance, _, distance_rate = measured_rate(seen, j, squared, half_rate, scales)
                     buddies = (e * own_inverse) * (e * inverse[j])
-                    change = TWO * logit_rate(distance, distance_rate, cool, cool_rate) - own_rate - rate[j]
+                    change = TWO * logit_rate(distance, distance_rate, scales[1], cool_rate) - own_rate - rate[j]
                     buddies_rate, length_rate = buddies * change, buddies * (change * distance + distance_rate)
                     a, b = a + buddies * weight[j], b + buddies * weight[j] * distance
                     a_rate, b_rate = a_rate + buddies_rate * weight[j], b_rate + length_rate * weight[j]

@@ -27,15 +27,15 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
-    exp_negative,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
     add_three,
     add_up,
     dot,
-    length,
+    kept_row,
     logit_rate,
+    measured_rate,
     plus,
     point_of,
     scaled,
@@ -58,9 +58,10 @@ def row_rates(rows, i):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def point_force_rates(rows, columns, normals, out, constants):  # type: ignore[no-untyped-def]
+def point_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """``point_forces`` and their rates."""
-    smooth, loss = constants[SMOOTH], loss_rates(constants)
+    rows, columns = sides
+    scales, loss = (constants[SMOOTH], constants[COOL]), loss_rates(constants)
     sums = np.empty((12, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -74,13 +75,14 @@ def point_force_rates(rows, columns, normals, out, constants):  # type: ignore[n
             for i in range(low, high):
                 (px, py, pz), row = point_of(rows, i), row_rates(rows, i)
                 ax = ay = az = bx = by = bz = heat = heat_rate = rounding = rounding_rate = px * ZERO
+                seen = kept_row(kept, i, first, last)
                 for j in range(qx.size):
                     offset, velocity = (qx[j] - px, qy[j] - py, qz[j] - pz), (vx[j], vy[j], vz[j])
-                    distance, over = length(dot(offset, offset), smooth)
-                    distance_rate = dot(offset, velocity) * over
+                    squared, half_rate = dot(offset, offset), dot(offset, velocity)
+                    e, distance, over, distance_rate = measured_rate(seen, j, squared, half_rate, scales)
                     rates = logit_rate(distance, distance_rate, loss[0], loss[3]), distance_rate
                     column = weight[j], inverse[j], share[j], inverse_rate[j], share_rate[j]
-                    slopes = slope_rate((exp_negative(-distance * loss[0]), distance), rates, row, column, loss)
+                    slopes = slope_rate((e, distance), rates, row, column, loss)
                     factor = slopes[1] * over
                     factor_rate = (slopes[3] - factor * distance_rate) * over
                     heat += slopes[0] * distance

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_dual_forces import add_sums, loss_rates, row_rates
+from bbr_layer.kernels.cpu_dual_forces import add_sums, loss_rates, point_force_rates, row_rates
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHUNK,
@@ -17,15 +17,14 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
-    exp_negative,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
     add_three,
     add_up,
     dot,
-    length,
     logit_rate,
+    measured_rate,
     plane,
     point_of,
     scaled,
@@ -43,11 +42,11 @@ def pushes(offsets, normals, scales, others):  # type: ignore[no-untyped-def]
     """
     (offset, velocity), loss = offsets, others[2]
     sign, total, residual = plane(offset, normals[0], normals[1], scales[1])
-    distance, over = length(residual * residual, scales[0])
     residual_rate = dot(velocity, total) + dot(offset, normals[2])
-    distance_rate = residual * residual_rate * over
+    half_rate = residual * residual_rate
+    e, distance, over, distance_rate = measured_rate(None, 0, residual * residual, half_rate, (scales[0], loss[0]))
     rates = logit_rate(distance, distance_rate, loss[0], loss[3]), distance_rate
-    slopes = slope_rate((exp_negative(-distance * loss[0]), distance), rates, others[0], others[1], loss)
+    slopes = slope_rate((e, distance), rates, others[0], others[1], loss)
     factor = slopes[1] * over
     factor_rate = (slopes[3] - factor * distance_rate) * over
     heat, heat_rate = slopes[0] * distance, slopes[2] * distance + slopes[0] * distance_rate
@@ -88,8 +87,9 @@ def add_products(out, row, vectors, pushed, signs):  # type: ignore[no-untyped-d
 
 
 @compiled()
-def plane_force_rates(rows, columns, normals, out, constants):  # type: ignore[no-untyped-def]
-    """``plane_forces`` and their rates: how hard each pair pushes, and what follows for points and for normals."""
+def plane_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
+    """``plane_forces`` and their rates, nothing kept used: what each pair pushes, points and normals."""
+    rows, columns = sides
     scales, loss = (constants[SMOOTH], constants[ALIGN]), loss_rates(constants)
     buffer = np.ones((4, min(TILE, columns.shape[1])), dtype=rows.dtype)
     sums = np.empty((12, columns.shape[1]), dtype=rows.dtype)
@@ -126,3 +126,12 @@ def plane_force_rates(rows, columns, normals, out, constants):  # type: ignore[n
                 add_three(out[0], ROW_OUT + 3, i, torque_rate)
                 add_sums(out[0], i, (heat, rounding), (heat_rate, rounding_rate))
         add_up(out[1], sums)
+
+
+@compiled()
+def force_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
+    """The last sweep in dual numbers, whichever the distance."""
+    if normals is None:
+        point_force_rates(sides, normals, out, constants, kept)
+    else:
+        plane_force_rates(sides, normals, out, constants, kept)

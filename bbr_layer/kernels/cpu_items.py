@@ -1,5 +1,12 @@
-"""Between the compiled sweeps: what the sums of one item say about its rows, its columns and its loss."""
+"""The compiled sweeps over one whole item, and what the sums between them say about its rows, columns and loss."""
 
+from typing import NamedTuple
+
+import numpy as np
+
+from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
+from bbr_layer.kernels.cpu_dual_planes import force_rates
+from bbr_layer.kernels.cpu_forces import forces
 from bbr_layer.kernels.cpu_math import (
     BY_M,
     BY_M_RATE,
@@ -12,6 +19,35 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     compiled,
 )
+from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators
+
+Both = tuple[np.ndarray, np.ndarray]
+
+
+class Loss(NamedTuple):
+    """The epsilon of Eq. 4, and whether the loss is M / S (Eq. 6) or -S (Eq. 5)."""
+
+    outlier: float
+    mean: bool
+
+
+class Tables(NamedTuple):
+    """One item as the sweeps read and fill it; ``Both`` are of the rows and of the columns.
+
+    Parameters
+    ----------
+    sides: ``(channels, n)`` and ``(channels, m)``, see ``cpu_math``.
+    normals: ``(3, n)`` and ``(6, m)``, or None.
+    sums: float64 ``(16, n)`` and ``(12, m)``, values before rates, as ``forces`` and its kin fill them.
+    shares: float64 ``(2, n)`` and ``(2, m)``: the loss per unit of weight of each point, and its rate.
+    constants: ``(c,)``.
+    """
+
+    sides: Both
+    normals: Both | None
+    sums: Both
+    shares: Both
+    constants: np.ndarray
 
 
 @compiled()
@@ -65,3 +101,55 @@ def settle_shares(side, sums, constants, shares, rates):  # type: ignore[no-unty
             change += constants[BY_M_RATE] * sums[1, i] + constants[BY_M] * sums[3, i]
             shares[1, i] = change
             side[SHARE_RATE, i] = change * side[WEIGHT, i]
+
+
+@compiled()
+def cleared(tables):  # type: ignore[no-untyped-def]
+    """Two tables of sums, set to 0."""
+    tables[0][:] = 0
+    tables[1][:] = 0
+    return tables
+
+
+@compiled()
+def settle_denominators(tables, loss, rates):  # type: ignore[no-untyped-def]
+    """After the first sweep."""
+    invert(tables.sides[0], tables.sums[0], loss.outlier, rates)
+    invert(tables.sides[1], tables.sums[1], loss.outlier, rates)
+
+
+@compiled()
+def settle_buddies(tables, loss, rates):  # type: ignore[no-untyped-def]
+    """After the second sweep: the loss."""
+    sides, sums, shares, constants = tables.sides, tables.sums, tables.shares, tables.constants
+    value = settle_loss(sides[0], sums[0], constants, loss.mean, rates)
+    settle_shares(sides[0], sums[0], constants, shares[0], rates)
+    settle_shares(sides[1], sums[1], constants, shares[1], rates)
+    return value
+
+
+@compiled()
+def item_gradient(tables, kept, loss):  # type: ignore[no-untyped-def]
+    """The loss of one item; its gradient is left in ``sums`` and ``shares``.
+
+    ``kept`` is room for what the first sweep keeps, or None.
+    """
+    sides, normals, sums, constants = tables.sides, tables.normals, tables.sums, tables.constants
+    denominators(sides, normals, cleared(sums), constants, kept)
+    settle_denominators(tables, loss, False)
+    buddy_sums(sides, normals, cleared(sums), constants, kept)
+    value = settle_buddies(tables, loss, False)
+    forces(sides, normals, cleared(sums), constants, kept)
+    return value
+
+
+@compiled()
+def item_rates(tables, kept, loss):  # type: ignore[no-untyped-def]
+    """The same and the rates of change of all of it."""
+    sides, normals, sums, constants = tables.sides, tables.normals, tables.sums, tables.constants
+    denominator_rates(sides, normals, cleared(sums), constants, kept)
+    settle_denominators(tables, loss, True)
+    buddy_sum_rates(sides, normals, cleared(sums), constants, kept)
+    value = settle_buddies(tables, loss, True)
+    force_rates(sides, normals, cleared(sums), constants, kept)
+    return value

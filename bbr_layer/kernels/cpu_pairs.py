@@ -1,8 +1,10 @@
 """What the compiled sweeps compute for one pair of points: distances, their rates of change, and slopes of the loss."""
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 
-from bbr_layer.kernels.cpu_math import ONE, TWO, ZERO, compiled
+from bbr_layer.kernels.cpu_math import ONE, TWO, ZERO, compiled, exp_negative
 
 
 @compiled(forceinline=True)
@@ -35,6 +37,21 @@ def add_up(total, part):  # type: ignore[no-untyped-def]
             total[k, j] += part[k, j]
 
 
+def kept_row(kept: tuple | None, i: int, first: int, last: int) -> tuple | None:
+    """What was kept for row ``i`` from column ``first`` to ``last``, as plain slices; None if nothing was."""
+    return None if kept is None else tuple(table[i, first:last] for table in kept)
+
+
+@overload(kept_row, inline="always")
+def _kept_row(kept, i, first, last):  # type: ignore[no-untyped-def]
+    # Chosen by type: what is sometimes None and sometimes not has no compiled type.
+    if kept == types.none:
+        return lambda kept, i, first, last: None
+    if len(kept) == 2:
+        return lambda kept, i, first, last: (kept[0][i, first:last], kept[1][i, first:last])
+    return lambda kept, i, first, last: (kept[0][i, first:last], kept[1][i, first:last], kept[2][i, first:last])
+
+
 @compiled(forceinline=True)
 def dot(a, b):  # type: ignore[no-untyped-def]
     """Inner product of two vectors of space."""
@@ -54,11 +71,37 @@ def plus(a, b):  # type: ignore[no-untyped-def]
 
 
 @compiled(forceinline=True)
+def inverse_of(root):  # type: ignore[no-untyped-def]
+    """One over a length; 0 at 0."""
+    return ONE / root if root > ZERO else ZERO
+
+
+@compiled(forceinline=True)
 def length(squared, smooth):  # type: ignore[no-untyped-def]
     """Root of a square, rounded off, and its inverse; 0 and 0 at 0."""
-    total = squared + smooth
-    root = np.sqrt(total)
-    return root, (ONE / root if total > ZERO else ZERO)
+    root = np.sqrt(squared + smooth)
+    return root, inverse_of(root)
+
+
+@compiled(forceinline=True)
+def measured(seen, j, squared, scales):  # type: ignore[no-untyped-def]
+    """exp(-D / alpha), the distance and its inverse: of ``squared``, or as ``seen`` has them for column ``j``.
+
+    ``scales`` are (smoothing squared, 1 / alpha).
+    """
+    if seen is None:
+        distance, over = length(squared, scales[0])
+        return exp_negative(-distance * scales[1]), distance, over
+    return seen[0][j], seen[1][j], inverse_of(seen[1][j])
+
+
+@compiled(forceinline=True)
+def measured_rate(seen, j, squared, half_rate, scales):  # type: ignore[no-untyped-def]
+    """The same, and the distance's rate; ``half_rate`` is half the rate of ``squared``."""
+    if seen is None:
+        distance, over = length(squared, scales[0])
+        return exp_negative(-distance * scales[1]), distance, over, half_rate * over
+    return seen[0][j], seen[1][j], inverse_of(seen[1][j]), seen[2][j]
 
 
 @compiled(forceinline=True)
@@ -80,18 +123,17 @@ def point_of(rows, i):  # type: ignore[no-untyped-def]
 
 
 @compiled(forceinline=True)
-def point_distance(offset, velocity, smooth):  # type: ignore[no-untyped-def]
-    """Distance between points, and its rate."""
-    distance, over = length(dot(offset, offset), smooth)
-    return distance, dot(offset, velocity) * over
+def plane_square(offset, normals, align):  # type: ignore[no-untyped-def]
+    """The square of Eq. 7's distance; ``normals`` are (row's, column's)."""
+    _, _, residual = plane(offset, normals[0], normals[1], align)
+    return residual * residual
 
 
 @compiled(forceinline=True)
-def plane_distance(motion, normals, smooth, align):  # type: ignore[no-untyped-def]
-    """Distance of Eq. 7 and its rate; ``motion`` is (offset, velocity), ``normals`` (row's, column's, its velocity)."""
+def plane_square_rate(motion, normals, align):  # type: ignore[no-untyped-def]
+    """The same and half its rate; ``motion`` is (offset, velocity), ``normals`` (row's, column's, its velocity)."""
     _, total, residual = plane(motion[0], normals[0], normals[1], align)
-    distance, over = length(residual * residual, smooth)
-    return distance, residual * (dot(motion[1], total) + dot(motion[0], normals[2])) * over
+    return residual * residual, residual * (dot(motion[1], total) + dot(motion[0], normals[2]))
 
 
 @compiled(forceinline=True)

@@ -6,18 +6,12 @@ reaches to ``r``, every point that is not listed is at least ``r - d`` away: if 
 ended at the nearest of all.
 """
 
-import inspect
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from bbr_layer.kernels.cpu_math import exact
 from bbr_layer.trees import ROUNDING
-
-
-def exact(function):  # type: ignore[no-untyped-def]
-    """Numba's decorator without fast arithmetic; what wraps a function in tests is taken off, as in ``cpu_math``."""
-    return njit(error_model="numpy", cache=True, nogil=True)(inspect.unwrap(function))
 
 
 class Lists(NamedTuple):
