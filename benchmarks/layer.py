@@ -2,10 +2,10 @@
 
     python -m benchmarks.layer --out benchmarks/layer.md
 
-Every cell of the first table runs in a process of its own, on one thread, in float32: the best of three after one run
-that compiles, and the growth of the process's peak memory over what it held before (what that first run, on fewer
-points, left in the heap is held). Rivals: the plain differentiable
-unroll (``Autograd()``), the same with every step checkpointed, and TorchOpt's MetaAdam (``pip install torchopt``).
+Every cell of the first table runs in a process of its own, on one thread, in float32: the best of three after runs on
+50 points that compile, and the growth of the process's peak memory over what it held before. Rivals: the plain
+differentiable unroll (``Autograd()``), the same with every step checkpointed, and TorchOpt's
+MetaAdam (``pip install torchopt``).
 """
 
 import argparse
@@ -22,14 +22,15 @@ import torch
 from torch import Tensor
 
 from bbr_layer import Adam, Autograd, BBRLayer, Implicit, Replay
+from bbr_layer.kernels import cpu_batch
 from benchmarks import layer_gradients, layer_rivals, layer_sweeps
 from benchmarks.layer_problems import clouds
 from benchmarks.memory import forget_peak, peak
 
 STEPS, RATE = 30, 0.05
 LOSSES = ("softBD", "softBBS", "N")
-# Points of the first run of the compiled sweeps: enough for a pair to be cut into parts, which is compiled apart.
-WARM_POINTS = 600
+# Points of the runs that compile, and pairs per part in them: one part and several, which are compiled apart.
+WARM_POINTS, WARM_PARTS = 50, (2500, 500)
 
 
 class Cell(NamedTuple):
@@ -65,9 +66,7 @@ def measured(name: str, who: str, n: int, steps: int) -> Cell:
         os.environ["BBR_BACKEND"] = "torch"
     register = contestants(name, steps)[who]()
     P, Q = (x.requires_grad_() for x in clouds(n))
-    few = WARM_POINTS if "compiled" in who else 50
-    warm = [x.detach()[:few].clone().requires_grad_() for x in (P, Q)]
-    torch.autograd.grad(register(*warm).square().sum(), warm)  # compiles, and loads what is loaded once
+    warm_up(register, P, Q)
     held = forget_peak()
     times = []
     for _ in range(1 if who in ("plain unroll", "TorchOpt MetaAdam") and n > 500 else 3):
@@ -77,6 +76,16 @@ def measured(name: str, who: str, n: int, steps: int) -> Cell:
         torch.autograd.grad(matrix.square().sum(), (P, Q))
         times.append((middle - begin, time.perf_counter() - begin))
     return Cell(min(t[0] for t in times), min(t[1] for t in times), peak() - held)
+
+
+def warm_up(register: Callable[[Tensor, Tensor], Tensor], P: Tensor, Q: Tensor) -> None:
+    """Compile, and load what is loaded once, on few points: what they leave in the heap is little."""
+    usual = cpu_batch.PAIRS_PER_PART
+    for pairs in WARM_PARTS:
+        cpu_batch.PAIRS_PER_PART = pairs
+        warm = [x.detach()[:WARM_POINTS].clone().requires_grad_() for x in (P, Q)]
+        torch.autograd.grad(register(*warm).square().sum(), warm)
+    cpu_batch.PAIRS_PER_PART = usual
 
 
 def in_own_process(function: Callable, *arguments: object) -> object:

@@ -1,7 +1,9 @@
 """How fast the compiled sweeps are: against the processor's own primitives, over threads, and over a training batch."""
 
+import multiprocessing
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numba
 import numpy as np
@@ -9,6 +11,8 @@ import torch
 
 from bbr_layer import Adam, BBRLayer, Replay
 from bbr_layer.kernels import cpu
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, room_to_keep
+from bbr_layer.kernels.cpu_items import Loss
 from bbr_layer.kernels.cpu_math import FAST, exp_negative
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 from bbr_layer.pair import CloudPair
@@ -17,9 +21,12 @@ from benchmarks.layer_problems import clouds
 PRIMITIVES_NOTE = (
     "Nanoseconds per pair on one thread, n = m = 1000, float32. The bound is what the arithmetic of a gradient alone "
     "costs on this machine, each part measured over an array in the first cache: three exponentials with their square "
-    "roots, one division, and 30 fused multiply-adds."
+    "roots, one division, and 30 fused multiply-adds. Each sweep as a walk calls it, with room for what it keeps."
 )
-THREADS_NOTE = "A batch of 8 pairs of 512 points, softBD, 30 steps, forward + backward."
+THREADS_NOTE = (
+    "A batch of 8 pairs of 512 points, softBD, 30 steps, forward + backward. The last row is what the machine itself "
+    "gives: two processes that share nothing, each with a batch of its own."
+)
 NUMBERS = 2048  # float32 numbers of one array of the primitives: 8 KiB
 REPEATS = 7
 
@@ -90,12 +97,10 @@ def sweep_rows() -> list[str]:
         lengths = torch.tensor([0.1], dtype=torch.float64), torch.tensor([0.01], dtype=torch.float64)
         scene = Scene(CloudPair(P, Q, P, Q), *lengths)
         direction = Direction(torch.ones_like(Q), torch.ones_like(Q), torch.zeros(1, dtype=torch.float64))
-        calls = {
-            "gradient": lambda scene=scene, terms=terms: cpu.gradient(terms, scene),
-            "directional derivative": lambda scene=scene, terms=terms, d=direction: cpu.directional(terms, scene, d),
-        }
-        for what, call in calls.items():
-            spent = best(call, 5) / 1e6 * 1e9
+        tables, loss = cpu.pack(terms, scene, direction).item(0), Loss(terms.outlier, terms.mean)
+        for what, sweeps in (("gradient", GRADIENT), ("directional derivative", DUAL)):
+            kept = room_to_keep(sweeps, tables)
+            spent = best(partial(sweeps.whole, tables, kept, loss), 5) / 1e6 * 1e9
             rows.append(f"| {name}, {what} | {spent:.2f} | {spent / bound:.2f} |")
     return rows
 
@@ -114,7 +119,17 @@ def thread_rows() -> list[str]:
         spent = best(_registration(8, 30), 1)
         alone = alone or spent
         rows.append(f"| {threads} | {spent:.3f} | {alone / spent:.2f} |")
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        spent = max(pool.map(_alone, range(2), chunksize=1))
+    rows.append(f"| 2 processes | {spent:.3f} | {2 * alone / spent:.2f} |")
     return rows
+
+
+def _alone(number: int) -> float:
+    """Seconds of the same batch in a process of its own, long enough for another one to run beside it."""
+    torch.set_num_threads(1)
+    run = _registration(8, 30)
+    return sorted(best(run, 1) for _ in range(3))[1]
 
 
 def batch_rows() -> list[str]:

@@ -6,7 +6,7 @@ from torch import Tensor, ones_like
 from bbr_layer.kernels import cpu_course
 from bbr_layer.kernels.cpu import pack
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
-from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, parts_of, room_to_keep, run_item
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Sweeps, parts_of, room_to_keep, run_item
 from bbr_layer.kernels.cpu_course import Adjoint, Cloud
 from bbr_layer.kernels.cpu_items import Loss
 from bbr_layer.kernels.scene import Scene, SoftTerms
@@ -33,7 +33,7 @@ class CompiledScene:
 
     def walk(self, number: int, course: Course, trace: Trace) -> None:
         """Take item ``number`` along all steps of the course."""
-        scene = self._item(number)
+        scene = self._item(number, GRADIENT)
         if not self.parted:
             cpu_course.walk(scene, course, trace)
             return
@@ -53,7 +53,7 @@ class CompiledScene:
         by_course: tuple[np.ndarray, np.ndarray],
     ) -> None:
         """Take the cotangents of its last point back to the first; ``by_course`` gets the temperatures' and rates'."""
-        scene = self._item(number)
+        scene = self._item(number, DUAL)
         if not self.parted:
             cpu_course.walk_back(scene, course, trace, out, by_course)
             return
@@ -63,17 +63,17 @@ class CompiledScene:
             pose, temperature = (trace.rotations[step], trace.translations[step]), course.temperatures[step]
             cpu_course.look(scene, pose, temperature)
             cpu_course.set_going(scene.cloud, tables.sides[1], tables.normals, pose, along)
-            run_item(DUAL, tables, scene.kept_rates, self.loss, self.batch)
+            run_item(DUAL, tables, scene.kept, self.loss, self.batch)
             heat = cpu_course.spread(scene.cloud, tables.sums, tables.shares, (pose, along), out)
             by_course[0][step] = heat / temperature**2
 
-    def _item(self, number: int) -> cpu_course.Scene:
+    def _item(self, number: int, sweeps: Sweeps) -> cpu_course.Scene:
         points = _channels(self.pair.Q[number])
         normals = np.zeros_like(points) if self.pair.Q_normals is None else _channels(self.pair.Q_normals[number])
         real = np.ones(points.shape[1], dtype=bool) if self.pair.Q_mask is None else self.pair.Q_mask[number].numpy()
         tables = self.packed.item(number)
         cloud = Cloud(points, normals, real, float(self.rounding[number]))
-        return cpu_course.Scene(cloud, tables, room_to_keep(GRADIENT, tables), room_to_keep(DUAL, tables), self.loss)
+        return cpu_course.Scene(cloud, tables, room_to_keep(sweeps, tables), self.loss)
 
 
 def _channels(vectors: Tensor) -> np.ndarray:

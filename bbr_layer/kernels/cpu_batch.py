@@ -88,12 +88,14 @@ def parts_of(batch: int, n: int, m: int) -> int:
 
 
 def run_sweeps(sweeps: Sweeps, packed: Packed, loss: Loss) -> np.ndarray:
-    """Losses of all items, ``(batch,)``; their gradients and, if asked, rates are left in ``packed``."""
+    """Losses of all items, ``(batch,)``; their gradients and, if asked, rates are left in ``packed``.
+
+    Nothing is kept between the sweeps: for a single call, fresh memory costs more than it saves.
+    """
     losses = np.zeros(len(packed.constants))
 
     def work(b: int) -> None:
-        tables = packed.item(b)
-        losses[b] = run_item(sweeps, tables, room_to_keep(sweeps, tables), loss, len(losses))
+        losses[b] = run_item(sweeps, packed.item(b), None, loss, len(losses))
 
     side_by_side(work, len(losses))
     return losses

@@ -31,12 +31,11 @@ class Cloud(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """One item under one loss; ``kept`` of the gradient and of its rates may be None."""
+    """One item under one loss; ``kept`` is room for what the first sweep keeps, or None."""
 
     cloud: Cloud
     tables: Tables
     kept: tuple[np.ndarray, ...] | None
-    kept_rates: tuple[np.ndarray, ...] | None
     loss: Loss
 
 
@@ -173,5 +172,5 @@ def walk_back(scene, course, trace, out, by_course):  # type: ignore[no-untyped-
         pose, temperature = (trace.rotations[step], trace.translations[step]), course.temperatures[step]
         look(scene, pose, temperature)
         set_going(scene.cloud, tables.sides[1], tables.normals, pose, along)
-        item_rates(tables, scene.kept_rates, scene.loss)
+        item_rates(tables, scene.kept, scene.loss)
         by_course[0][step] = spread(scene.cloud, tables.sums, tables.shares, (pose, along), out) / temperature**2

@@ -1,5 +1,7 @@
 """What the compiled sweeps compute for one pair of points: distances, their rates of change, and slopes of the loss."""
 
+from typing import Any
+
 import numpy as np
 from numba import types
 from numba.extending import overload
@@ -37,7 +39,7 @@ def add_up(total, part):  # type: ignore[no-untyped-def]
             total[k, j] += part[k, j]
 
 
-def kept_row(kept: tuple | None, i: int, first: int, last: int) -> tuple | None:
+def kept_row(kept: Any, i: int, first: int, last: int) -> Any:
     """What was kept for row ``i`` from column ``first`` to ``last``, as plain slices; None if nothing was."""
     return None if kept is None else tuple(table[i, first:last] for table in kept)
 
