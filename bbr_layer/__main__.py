@@ -45,6 +45,7 @@ def register(
     out: Annotated[Path | None, typer.Option(help="Write the moved source here: .ply .pcd .npz .csv .xyz")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Answer in JSON and nothing else.")] = False,
     start: Annotated[Path | None, typer.Option(help="A text file: the 4 x 4 target_from_source to begin with.")] = None,
+    starts: Annotated[int, typer.Option(help="Starting rotations tried by the soft stage; 7 for far turns.")] = 1,
     points: Annotated[int, typer.Option(help="Points of each cloud in the soft stage.")] = SOFT_POINTS,
     seed: Annotated[int, typer.Option(help="Of the random choice of points.")] = 0,
 ) -> None:
@@ -55,7 +56,7 @@ def register(
         whole = read_cloud(source)
         P, Q = common_dimension(read_cloud(target), whole)
         begun = None if start is None else _of_dimension(read_motion(start), P.points.shape[1])
-        found = register_clouds(P, Q, loss=loss.value, start=begun, soft_points=points, seed=seed)
+        found = register_clouds(P, Q, loss=loss.value, start=begun, starts=starts, soft_points=points, seed=seed)
         answer = described(found, P, Q)
         if out is not None:
             write_moved(out, whole, np.array(answer["target_from_source"]))

@@ -44,6 +44,7 @@ def register_clouds(
     *,
     loss: str = DEFAULT_LOSS,
     start: Float[np.ndarray, "d1 d1"] | None = None,
+    starts: int = 1,
     soft_points: int = SOFT_POINTS,
     seed: int = 0,
 ) -> TwoClouds:
@@ -54,6 +55,7 @@ def register_clouds(
     target, source: clouds of one dimension, see ``common_dimension``.
     loss: "softBBS", "softBD", "N" or "F" alone; "default": soft buddies, then F, then F on more points.
     start: ``(d + 1, d + 1)`` target_from_source to begin with; None: in place or centroid on centroid.
+    starts: how many starting rotations the first stage tries, see ``BBRLayer``.
     soft_points: how many points of each cloud the soft stages see, drawn at random.
     seed: of that draw.
 
@@ -71,8 +73,10 @@ def register_clouds(
     draw = np.random.default_rng(seed)
     if loss == DEFAULT_LOSS:
         P, Q = (_sample(cloud, soft_points, draw) for cloud in (target, source))
-        motion = _run(BBRLayer(backward=Detached()), P, Q, motion).target_from_source
-    last = BBRLayer("F" if loss == DEFAULT_LOSS else loss, backward=Detached())
+        motion = _run(BBRLayer(backward=Detached(), starts=starts), P, Q, motion).target_from_source
+        last = BBRLayer("F", backward=Detached())
+    else:
+        last = BBRLayer(loss, backward=Detached(), starts=starts)
     count = max(FINE_POINTS, soft_points) if loss in (DEFAULT_LOSS, "F") else soft_points
     P, Q = (_sample(cloud, count, draw) for cloud in (target, source))
     result = _run(last, P, Q, motion)

@@ -45,6 +45,7 @@ ORDER = {
         inner.run inner.implicit
         backward transforms preparation
         stage
+        starts
         layer
         atomic cloud_columns
         cloud_tables cloud_formats cloud_writing trajectories

@@ -1,0 +1,88 @@
+"""Several starting rotations: where one start fails, and what the choice does not touch."""
+
+import math
+
+import pytest
+import torch
+from test_sensitivity import bumpy
+
+from bbr_layer import BBRLayer, Detached, RigidMotion, angular_error
+from bbr_layer.inner.adam import Adam
+from bbr_layer.starts import TURN, most_starts, turns
+
+
+def _turned(d, degrees, seed):
+    torch.manual_seed(seed)
+    P = bumpy(150, d)
+    axis = torch.randn(d * (d - 1) // 2, dtype=torch.float64)
+    vector = axis / axis.norm() * math.radians(degrees)
+    truth = RigidMotion.from_rotvec(vector, torch.zeros(d, dtype=torch.float64))
+    return P, truth.inverse()(P) + 0.01 * torch.randn_like(P), truth
+
+
+def _error(result, truth):
+    return torch.rad2deg(angular_error(result.target_from_source.rotation, truth.rotation))
+
+
+@pytest.mark.parametrize(("d", "degrees", "seed"), [(3, 90, 1), (3, 90, 8), (2, 100, 0)])
+def test_several_starts_find_what_one_misses(d, degrees, seed):
+    P, Q, truth = _turned(d, degrees, seed)
+    assert _error(BBRLayer(backward=Detached())(P, Q), truth) > 20
+    assert _error(BBRLayer.robust(Detached())(P, Q), truth) < 1
+
+
+def test_every_item_keeps_its_own_best():
+    pairs = [_turned(3, 90, seed) for seed in (1, 2)]
+    P, Q, truths = zip(*pairs, strict=True)
+    together = BBRLayer.robust(Detached())(torch.stack(P), torch.stack(Q))
+    for b in range(2):
+        alone = BBRLayer.robust(Detached())(P[b], Q[b])
+        torch.testing.assert_close(together.target_from_source.matrix[b], alone.target_from_source.matrix)
+        assert _error(alone, truths[b]) < 2
+
+
+def test_masked_points_and_weights_follow_their_item():
+    P, Q, truth = _turned(3, 90, 1)
+    mask = torch.arange(200) < 150
+    padded = [torch.cat((x, torch.full((50, 3), 9.0, dtype=x.dtype))) for x in (P, Q)]
+    result = BBRLayer.robust(Detached())(*padded, P_mask=mask, Q_mask=mask, Q_weights=torch.ones(200).double())
+    plain = BBRLayer.robust(Detached())(P, Q)
+    torch.testing.assert_close(result.target_from_source.matrix, plain.target_from_source.matrix, rtol=0, atol=1e-6)
+
+
+def test_the_gradient_is_that_of_the_run_from_the_chosen_start():
+    P, Q, _ = _turned(3, 40, 2)
+    P.requires_grad_()
+    layer = BBRLayer("softBBS", starts=7)
+    found = torch.autograd.grad(layer(P, Q).target_from_source.translation.sum(), P)[0]
+    direction, step = torch.randn_like(P), 1e-6
+    with torch.no_grad():
+        ahead, behind = (layer(P + s * direction, Q).target_from_source.translation.sum() for s in (step, -step))
+    torch.testing.assert_close((found * direction).sum(), (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_turns_are_all_different_and_no_longer_than_half_a_turn(d):
+    count = most_starts(d)
+    rotations = turns(count, d)
+    assert torch.equal(rotations[0], torch.eye(d, dtype=torch.float64))
+    apart = angular_error(rotations[:, None], rotations[None, :]) + 9 * torch.eye(count)
+    assert apart.min() > TURN / 2
+    assert angular_error(rotations[0], rotations).max() < math.pi
+
+
+@pytest.mark.parametrize("starts", [0, -1, 1.5, "many"])
+def test_wrong_starts_are_refused(starts, as_a_user):
+    with pytest.raises(ValueError, match=f"starts is {starts}; it must be a whole number of at least 1"):
+        BBRLayer(starts=starts)
+
+
+def test_more_starts_than_there_are_is_refused():
+    P, Q, _ = _turned(2, 10, 0)
+    with pytest.raises(ValueError, match="starts is 10; in 2D there are 9 of them at most"):
+        BBRLayer(starts=10)(P, Q)
+
+
+def test_repr_names_the_starts():
+    assert repr(BBRLayer("F", inner=Adam(2), starts=3)).endswith("starts=3)")
+    assert "starts" not in repr(BBRLayer())
