@@ -2,7 +2,8 @@
 
 A soft loss is a function of S = sum B and M = sum B D, where B are the soft buddies of Eq. 4 and D the distances:
 softBBS is -S (Eq. 5), softBD and N are M / S (Eq. 6). Its gradient needs three sweeps over the n x m pairs, of which
-nothing but row and column sums is kept; the derivative of that gradient along a direction needs the same three in dual
+nothing but row and column sums is kept (compiled, a step also keeps exponentials and distances of up to 2^20 pairs from
+its first sweep for the other two); the derivative of that gradient along a direction needs the same three in dual
 numbers.
 """
 
