@@ -54,8 +54,8 @@ def main() -> None:
     torch.set_num_threads(1)
     lines = [
         f"Made by `python -m benchmarks.starts --repeats {options.repeats}`: {POINTS} points of each cloud, none "
-        "shared, normals estimated from each; failures over 5 degrees, median error in degrees, processor seconds of one "
-        "registration on one thread.",
+        "shared, normals estimated from each; failures over 5 degrees, median error in degrees, processor seconds of "
+        "one registration on one thread.",
         "",
         "| model | turn, deg | `BBRLayer()`: failures | median | s | `BBRLayer.robust()`: failures | median | s |",
         "|---|---|---|---|---|---|---|---|",
