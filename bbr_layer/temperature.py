@@ -32,8 +32,8 @@ class Annealed(nn.Module):
         _check_positive("end", end)
         self.start, self.end = start, end
 
-    def at(self, fraction: float, spacing: Tensor) -> Tensor:
-        """Temperature ``(batch,)`` when ``fraction`` in [0, 1] of the steps are done."""
+    def at(self, fraction: float | Tensor, spacing: Tensor) -> Tensor:
+        """Temperature ``(batch,)`` when ``fraction`` in [0, 1] of the steps are done; of many ``(steps, 1)``, rows."""
         start, end = (torch.as_tensor(x, dtype=spacing.dtype, device=spacing.device) for x in (self.start, self.end))
         return spacing * start ** (1 - fraction) * end**fraction
 
@@ -72,7 +72,7 @@ class Learned(nn.Module):
         _check_positive("minimum", minimum)
         self.start, self.minimum = start, minimum
 
-    def at(self, fraction: float, spacing: Tensor) -> Tensor:
+    def at(self, fraction: float | Tensor, spacing: Tensor) -> Tensor:
         """Refused: a learned temperature follows no schedule."""
         raise ValueError("a learned temperature has no schedule; ask Annealed for one")
 
@@ -93,7 +93,7 @@ class Unrounded(nn.Module):
 
     learned = False
 
-    def at(self, fraction: float, spacing: Tensor) -> Tensor:
+    def at(self, fraction: float | Tensor, spacing: Tensor) -> Tensor:
         """0 for every item, ``(batch,)``."""
         return torch.zeros_like(spacing)
 

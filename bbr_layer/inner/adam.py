@@ -1,5 +1,6 @@
 """Adam (Kingma & Ba 2014) as a pure step, differentiable with respect to everything that enters it."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -114,13 +115,13 @@ class Adam(nn.Module):
         self.translation_rate, self.temperature_rate = translation_rate, temperature_rate
         self.betas, self.eps, self.shared, self.keep = betas, eps, shared, keep
 
-    def rates(self, sizes: tuple[int, ...], like: Tensor, step: int) -> Tensor:
-        """Rate of each component, rotation, translation and temperature in blocks of ``sizes``, at ``step``."""
+    def rates(self, sizes: tuple[int, ...], like: Tensor, steps: Sequence[int]) -> Tensor:
+        """Rates ``(steps, k)`` of rotation, translation and temperature in blocks of ``sizes`` at the steps given."""
         own = (self.rate, self.translation_rate, self.temperature_rate)[: len(sizes)]
         each = [torch.as_tensor(self.rate if r is None else r, dtype=like.dtype, device=like.device) for r in own]
-        return self.schedule.factor(step, self.steps) * torch.cat(
-            [r.expand(size) for r, size in zip(each, sizes, strict=True)]
-        )
+        factors = torch.tensor([self.schedule.factor(step, self.steps) for step in steps], dtype=like.dtype)
+        blocks = [r.expand(size) for r, size in zip(each, sizes, strict=True)]
+        return factors.to(like.device)[:, None] * torch.cat(blocks)
 
     def extra_repr(self) -> str:
         shown = [f"steps={self.steps}", f"rate={_plain(self.rate)}"]

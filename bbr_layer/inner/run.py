@@ -90,11 +90,11 @@ def _walked(problem: Problem, look: "Callable[[CloudPair, Tensor], Scene]", at: 
 
     loss, inner, done, d = problem.loss, problem.inner, at.moments.step, at.state.translation.shape[-1]
     assert isinstance(loss, PairKernel)
-    shares = [share_done(number, inner.steps) for number in range(done, done + steps)]
-    lowest = floor(problem)
-    temperatures = torch.stack([torch.maximum(problem.temperature.at(x, problem.unit), lowest) for x in shares])
-    blocks = rotation_dimensions(d), d
-    rates = torch.stack([inner.rates(blocks, at.moments.first, number) for number in range(done, done + steps)])
+    numbers = range(done, done + steps)
+    shares = problem.unit.new_tensor([share_done(number, inner.steps) for number in numbers])[:, None]
+    temperatures = torch.maximum(problem.temperature.at(shares, problem.unit), floor(problem))
+    temperatures = temperatures.expand(steps, -1)  # Unrounded is one row for all
+    rates = inner.rates((rotation_dimensions(d), d), at.moments.first, numbers)
     begun = (*at.state, at.moments.first, at.moments.second)
     end = walk(Steps(look, inner, done), (loss.pair, loss.rounding), begun, temperatures, rates)
     moments = Moments(end.first, end.second, done + steps)

@@ -75,7 +75,7 @@ def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
     direction, moments = adam_direction(
         gradient, at.moments, betas=inner.betas, eps=inner.eps, blocks=blocks if inner.shared else None
     )
-    move = -inner.rates(blocks, direction, at.moments.step) * direction
+    move = -inner.rates(blocks, direction, [at.moments.step]) * direction
     pose_size = blocks[0] + blocks[1]
     state = problem.chart.moved(at.state, move[:, :pose_size])
     later = torch.maximum(temperature + move[:, -1], floor(problem)) if learned else temperature
