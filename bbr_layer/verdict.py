@@ -142,7 +142,8 @@ def _doubts(status_words: str, share: float, close: float) -> list[str]:
 
 def _sentence(doubts: list[str], share: float, close: float) -> str:
     if doubts:
-        return f"Do not trust this without a look: {'; '.join(doubts)}. Try a start near the answer (--start)."
+        advice = "Try several starts (--starts 7), or one near the answer (--start)."
+        return f"Do not trust this without a look: {'; '.join(doubts)}. {advice}"
     return (
         f"Trustworthy: {share:.0%} of the points have a best buddy, {close:.0%} of them closer than their neighbours."
     )

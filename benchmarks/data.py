@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bbr_layer import RigidMotion
+
 PROJECT = Path(__file__).resolve().parent.parent
 
 
@@ -26,3 +28,13 @@ def data_folder() -> Path:
 def model(name: str) -> Tensor:
     """Points of one full model, ``(n, 3)`` float64."""
     return torch.from_numpy(np.load(data_folder() / f"model_{name}.npz")["points"]).double()
+
+
+def scan(name: str) -> Tensor:
+    """The points ``(n, 3)`` of one of the bunny's range scans, put in place by its known pose, float64."""
+    arrays = np.load(data_folder() / "seq_stanford_bunny.npz")
+    number = arrays["names"].tolist().index(f"{name}.ply")
+    points = arrays["points"][arrays["offsets"][number] : arrays["offsets"][number + 1]]
+    return RigidMotion.from_matrix(torch.from_numpy(arrays["poses"][number]).double())(
+        torch.from_numpy(points).double()
+    )

@@ -2,13 +2,16 @@
 
     python -m benchmarks.starts --repeats 20 --out benchmarks/starts.md
 
-Two random subsets of 500 points that share no point, each with normals of its own (none are given), float32; one is
-turned about a random axis. Failure is an error over 5 degrees. The two layers see the same trials.
+Models: two random subsets of 500 points that share no point; scans: a subset of each of two of the bunny's range scans,
+put in place by the known poses. Normals are each subset's own (none are given), float32; the source is turned about a
+random axis, the scans' about its centroid. Failure is an error over 5 degrees. The two layers see the same trials.
 """
 
 import argparse
 import math
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,33 +19,59 @@ import torch
 from torch import Tensor
 
 from bbr_layer import BBRLayer, Detached, RigidMotion, angular_error
-from benchmarks.data import model
+from benchmarks.data import model, scan
 
 MODELS = ("bun_zipper", "horse", "dragon_vrip_res3")
 ANGLES_DEG = (30.0, 60.0, 90.0)
 POINTS = 500
+# Target, source, degrees from and to, points of each: the paper's Fig. 4 and 7.
+SCANS = (
+    ("bun000", "bun090", 5.0, 5.0, 200),
+    ("bun000", "bun090", 5.0, 5.0, 500),
+    ("bun000", "bun090", 5.0, 5.0, 1000),
+    ("bun180", "bun270", 30.0, 50.0, 1000),
+)
+Pair = tuple[Tensor, Tensor, RigidMotion]
 FAILURE_DEG = 5.0
 
 
-def trial(cloud: Tensor, layer: BBRLayer, degrees: float, seed: int) -> float:
-    """Angular error in degrees of one registration."""
+def turned_model(cloud: Tensor, degrees: float, seed: int) -> Pair:
+    """Target, source and the motion that is sought."""
     generator = torch.Generator().manual_seed(seed)
     first, second = torch.randperm(len(cloud), generator=generator)[: 2 * POINTS].split(POINTS)
     axis = torch.randn(3, generator=generator, dtype=torch.float64)
     truth = RigidMotion.from_rotvec(axis / axis.norm() * math.radians(degrees), torch.zeros(3, dtype=torch.float64))
-    result = layer(truth(cloud[first]).float(), cloud[second].float())
+    return truth(cloud[first]), cloud[second], truth
+
+
+def turned_scan(target: Tensor, source: Tensor, degrees: tuple[float, float], count: int, seed: int) -> Pair:
+    """The same for two scans in one frame."""
+    generator = torch.Generator().manual_seed(seed)
+    P, Q = (scan[torch.randperm(len(scan), generator=generator)[:count]] for scan in (target, source))
+    axis = torch.randn(3, generator=generator, dtype=torch.float64)
+    angle = degrees[0] + (degrees[1] - degrees[0]) * torch.rand(1, generator=generator, dtype=torch.float64)
+    turn = RigidMotion.from_rotvec(axis / axis.norm() * torch.deg2rad(angle), torch.zeros(3, dtype=torch.float64))
+    centre = Q.mean(0)
+    truth = RigidMotion(turn.rotation, centre - turn.rotation @ centre).inverse()
+    return P, truth.inverse()(Q), truth
+
+
+def error(layer: BBRLayer, pair: Pair) -> float:
+    """Angular error in degrees of one registration."""
+    P, Q, truth = pair
+    result = layer(P.float(), Q.float())
     return math.degrees(angular_error(result.target_from_source.rotation, truth.rotation).item())
 
 
-def row(name: str, cloud: Tensor, degrees: float, repeats: int) -> str:
+def row(name: str, turn: str, make: Callable[[int], Pair], repeats: int) -> str:
     """One table row: failures, median error and processor seconds of both layers."""
     cells = []
     for layer in (BBRLayer(backward=Detached()), BBRLayer.robust(Detached())):
         before = time.process_time()
-        errors = np.array([trial(cloud, layer, degrees, seed) for seed in range(repeats)])
+        errors = np.array([error(layer, make(seed)) for seed in range(repeats)])
         seconds = (time.process_time() - before) / repeats
         cells.append(f"{(errors > FAILURE_DEG).sum()}/{repeats} | {np.median(errors):.3f} | {seconds:.2f}")
-    return f"| {name} | {degrees:g} | " + " | ".join(cells) + " |"
+    return f"| {name} | {turn} | " + " | ".join(cells) + " |"
 
 
 def main() -> None:
@@ -53,20 +82,32 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     lines = [
-        f"Made by `python -m benchmarks.starts --repeats {options.repeats}`: {POINTS} points of each cloud, none "
+        f"Made by `python -m benchmarks.starts --repeats {options.repeats}`: points of each cloud as named, none "
         "shared, normals estimated from each; failures over 5 degrees, median error in degrees, processor seconds of "
         "one registration on one thread.",
         "",
-        "| model | turn, deg | `BBRLayer()`: failures | median | s | `BBRLayer.robust()`: failures | median | s |",
+        "| clouds | turn, deg | `BBRLayer()`: failures | median | s | `BBRLayer.robust()`: failures | median | s |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name in MODELS:
         cloud = model(name).double()
         BBRLayer.robust(Detached())(cloud[:50].float(), cloud[50:100].float())  # what is compiled once does not count
         for degrees in ANGLES_DEG:
-            lines.append(row(name, cloud, degrees, options.repeats))
+            make = partial(turned_model, cloud, degrees)
+            lines.append(row(f"{name}, {POINTS}", f"{degrees:g}", make, options.repeats))
             print(lines[-1], flush=True)
-            options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for first, second, low, high, count in SCANS:
+        make = partial(turned_scan, scan(first), scan(second), (low, high), count)
+        lines.append(
+            row(
+                f"{first}, {second}, {count}",
+                f"{low:g}" if low == high else f"{low:g} to {high:g}",
+                make,
+                options.repeats,
+            )
+        )
+        print(lines[-1], flush=True)
+    options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
