@@ -154,11 +154,11 @@ class BBRLayer(nn.Module):
         if self.starts > 1:
             motion, stages[0] = best_start(self.starts, stages[0], (pair, frame), motion)
         mode = self.backward_mode if differentiable else Detached()
-        ended = descended(stages, (pair, frame), motion, mode)
+        ended = _descended(stages, (pair, frame), motion, mode)
         if isinstance(mode, Implicit):
             ended, doubt = self.sequence[-1].attach(pair, frame, ended, mode.damping)
             if doubt and mode.on_unconverged == "replay":
-                ended = descended(stages, (pair, frame), motion, Replay())
+                ended = _descended(stages, (pair, frame), motion, Replay())
             elif doubt:
                 speak_up(mode, doubt)
         buddies, information = matched_information(pair, frame.enter(ended.motion), frame)
@@ -178,7 +178,9 @@ class BBRLayer(nn.Module):
         return f"BBRLayer({stages}, backward={self.backward_mode!r}{starts})"
 
 
-def descended(stages: list[Stage], clouds: tuple[CloudPair, Frame], motion: RigidMotion, mode: Backward) -> StageResult:
+def _descended(
+    stages: list[Stage], clouds: tuple[CloudPair, Frame], motion: RigidMotion, mode: Backward
+) -> StageResult:
     """All stages, each from where the last one ended."""
     steps, done = sum(stage.inner.steps for stage in stages), 0
     for stage in stages:

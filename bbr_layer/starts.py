@@ -18,16 +18,17 @@ from bbr_layer.temperature import Annealed
 # horse and dragon turned by 30, 60 or 90 degrees fails; benchmarks/starts.md.
 TURN = math.radians(40)
 # Point spacings that the soft buddies of every start but the first begin at: a start that is only near needs to see
-# farther. Measured on the dragon turned by 90 degrees: with the stage's own heat one in ten fails.
+# farther. Chosen; no benchmark compares it with others.
 HOT = 8.0
-# Another start replaces the first where it finds this share more buddies. Measured on the bunny's range scans: at 0
-# sparse ones 5 degrees off fail once more in twenty; at 0.2 those 30 to 50 degrees off fail 7 times instead of once.
+# Another start replaces the first where it finds this share more buddies. Chosen by benchmarks/starts.py with other
+# values put here: at 0 sparse range scans 5 degrees off fail once more in twenty, at 0.2 those 30 to 50 degrees off
+# fail 7 times instead of once.
 RELUCTANCE = 0.1
 
 
 def most_starts(d: int) -> int:
     """How many starts there are: turns to both sides about every axis, as long as they stay below half a turn."""
-    return 1 + 2 * rotation_dimensions(d) * int((math.pi - TURN / 2) // TURN)
+    return 1 + 2 * rotation_dimensions(d) * int(math.pi // TURN)
 
 
 def turns(count: int, d: int) -> Tensor:

@@ -42,3 +42,11 @@ def as_pair(given: dict[str, torch.Tensor], *names: str) -> CloudPair:
     """P, Q and the companions named (``"normals"``, ...), with a spacing of 0.5."""
     chosen = {k: v for k, v in given.items() if k in ("P", "Q") or k.split("_")[1] in names}
     return CloudPair(**chosen, spacing=torch.full((given["P"].shape[0],), 0.5, dtype=torch.float64))
+
+
+def bumpy(n: int, d: int) -> torch.Tensor:
+    """A closed curve or surface with no symmetry, float64."""
+    directions = torch.randn(n, d, dtype=torch.float64)
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    bumps = 1 + 0.3 * torch.sin(2 * directions[:, :1] + 1) * torch.cos(3 * directions[:, 1:2])
+    return directions * bumps * torch.tensor([1.0, 0.7, 0.5][:d], dtype=torch.float64)

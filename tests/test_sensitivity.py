@@ -10,19 +10,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from problems import bumpy
 from torch import Tensor
 
 from bbr_layer import Adam, BBRLayer, Implicit, Registration, RigidMotion
 
 FACTOR = 2.0
-
-
-def bumpy(n: int, d: int) -> Tensor:
-    """A closed curve or surface with no symmetry, float64."""
-    directions = torch.randn(n, d, dtype=torch.float64)
-    directions = directions / directions.norm(dim=1, keepdim=True)
-    bumps = 1 + 0.3 * torch.sin(2 * directions[:, :1] + 1) * torch.cos(3 * directions[:, 1:2])
-    return directions * bumps * torch.tensor([1.0, 0.7, 0.5][:d], dtype=torch.float64)
 
 
 def exact_copy(P: Tensor) -> Tensor:

@@ -4,11 +4,13 @@ import math
 
 import pytest
 import torch
-from test_sensitivity import bumpy
+from problems import bumpy
 
-from bbr_layer import BBRLayer, Detached, RigidMotion, angular_error
+from bbr_layer import BBRLayer, CloudPair, Detached, RigidMotion, angular_error
 from bbr_layer.inner.adam import Adam
-from bbr_layer.starts import TURN, most_starts, turns
+from bbr_layer.preparation import prepared
+from bbr_layer.stage import named_stage
+from bbr_layer.starts import HOT, TURN, best_start, most_starts, turns
 
 
 def _turned(d, degrees, seed):
@@ -29,6 +31,24 @@ def test_several_starts_find_what_one_misses(d, degrees, seed):
     P, Q, truth = _turned(d, degrees, seed)
     assert _error(BBRLayer(backward=Detached())(P, Q), truth) > 20
     assert _error(BBRLayer.robust(Detached())(P, Q), truth) < 1
+
+
+def test_an_easy_pair_is_registered_as_from_one_start():
+    P, Q, _ = _turned(3, 20, 0)
+    one, several = BBRLayer(backward=Detached())(P, Q), BBRLayer.robust(Detached())(P, Q)
+    assert torch.equal(one.target_from_source.matrix, several.target_from_source.matrix)
+
+
+def test_only_other_starts_begin_hotter():
+    P, Q, _ = _turned(3, 90, 1)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    begun = RigidMotion.identity(3, (1,))
+    far = best_start(7, named_stage("softBBS"), (pair, frame), begun)
+    assert not torch.equal(far.motion.rotation, begun.rotation)
+    assert far.stage.temperature.start == HOT
+    assert best_start(7, named_stage("F"), (pair, frame), begun).stage.temperature.start == 0.3
+    easy = best_start(7, named_stage("softBBS"), (pair, frame), BBRLayer.robust(Detached())(P[None], Q[None])[0])
+    assert easy.stage.temperature.start == named_stage("softBBS").temperature.start
 
 
 def test_every_item_keeps_its_own_best():

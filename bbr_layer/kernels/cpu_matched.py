@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bbr_layer.kernels.cpu_math import compiled
+from bbr_layer.kernels.cpu_turns import apply, cross
 
 # Directions of a further turn and shift of the pose.
 TANGENT = 6
@@ -33,17 +34,7 @@ def _scale(clouds, index, mutual):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _carry(matrix, table, row):  # type: ignore[no-untyped-def]
-    x, y, z = table[row, 0], table[row, 1], table[row, 2]
-    return (
-        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
-        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
-        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
-    )
-
-
-@compiled()
-def _cross(a, b):  # type: ignore[no-untyped-def]
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return apply(matrix, (table[row, 0], table[row, 1], table[row, 2]))
 
 
 @compiled()
@@ -82,7 +73,7 @@ def slope_of(clouds, pairs, pose, temperature):  # type: ignore[no-untyped-def]
         squared = residual * residual + temperature * temperature
         if squared > 0:
             push = scale * clouds.P_weights[i] * clouds.Q_weights[j] * residual / np.sqrt(squared)
-            torque = _combined(1.0, _cross(arm, plane), 1.0, _cross(turned, offset))
+            torque = _combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
             for k in range(3):
                 slope[k] += push * torque[k]
                 slope[3 + k] += push * plane[k]
@@ -98,7 +89,7 @@ def _rates(placed, weight, temperature, along):  # type: ignore[no-untyped-def]
     """
     arm, turned, offset, plane, _ = placed
     turn, shift = along
-    velocity, spin = _combined(1.0, _cross(turn, arm), 1.0, shift), _cross(turn, turned)
+    velocity, spin = _combined(1.0, cross(turn, arm), 1.0, shift), cross(turn, turned)
     residual = _dot(offset, plane)
     residual_rate = _dot(velocity, plane) + _dot(offset, spin)
     squared = residual * residual + temperature * temperature
@@ -108,8 +99,8 @@ def _rates(placed, weight, temperature, along):  # type: ignore[no-untyped-def]
     over_rate = -over * rate * inverse
     push, push_rate = over * residual, over_rate * residual + over * residual_rate
     force_rate, torque_rate = _combined(push_rate, plane, push, spin), _combined(push_rate, offset, push, velocity)
-    pull = _combined(1.0, force_rate, -push, _cross(turn, plane))
-    twist = _combined(1.0, torque_rate, -push, _cross(turn, offset))
+    pull = _combined(1.0, force_rate, -push, cross(turn, plane))
+    twist = _combined(1.0, torque_rate, -push, cross(turn, offset))
     return pull, twist, force_rate, torque_rate, rate, temperature * over_rate
 
 
