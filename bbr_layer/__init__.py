@@ -21,6 +21,7 @@ from bbr_layer.geometry import translation_error as translation_error
 from bbr_layer.inner.adam import Adam as Adam
 from bbr_layer.inner.charts import EulerAngles as EulerAngles
 from bbr_layer.inner.charts import RotationVector as RotationVector
+from bbr_layer.inner.gauss_newton import GaussNewton as GaussNewton
 from bbr_layer.inner.schedules import Constant as Constant
 from bbr_layer.inner.schedules import Cosine as Cosine
 from bbr_layer.inner.schedules import StepDown as StepDown

@@ -13,6 +13,8 @@ from bbr_layer.distances import smooth_root, squared_distances
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.scene import Kernel, SoftTerms
 from bbr_layer.kernels.soft import SoftKernel
+from bbr_layer.kernels.soft_squares import SoftSquares
+from bbr_layer.kernels.squares import Squares
 from bbr_layer.normals import point_spacing
 from bbr_layer.pair import CloudPair
 
@@ -48,6 +50,10 @@ class Loss(nn.Module, ABC):
     @abstractmethod
     def kernel(self, pair: CloudPair) -> Kernel:
         """The loss in closed form, for a pair whose source is not yet moved."""
+
+    @abstractmethod
+    def squares(self, pair: CloudPair) -> Squares:
+        """The loss as least squares over held buddies, for ``GaussNewton``; the source of ``pair`` is not yet moved."""
 
     def temperature_unit(self, pair: CloudPair) -> Tensor:
         """Spacing that temperatures are multiples of, ``(batch,)``."""
@@ -85,6 +91,17 @@ class SoftLoss(Loss):
         if match != "points":
             pair.both_features()
         return SoftKernel(self.terms(match))
+
+    def squares(self, pair: CloudPair) -> Squares:
+        """All pairs, each counting as much as it is a buddy."""
+        match = self._matching(pair)
+        if match != "points":
+            pair.both_features()
+        return SoftSquares(self, self.terms(match))
+
+    @abstractmethod
+    def distances(self, pair: CloudPair) -> Float[Tensor, "batch n m"]:
+        """What the loss lowers, for every pair of points."""
 
     @abstractmethod
     def terms(self, match: str) -> SoftTerms:

@@ -12,6 +12,7 @@ from bbr_layer.distances import matched_plane_normals, point_to_point, smooth_ro
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.scene import Kernel, SoftTerms
+from bbr_layer.kernels.squares import MatchedSquares, Squares, gathered
 from bbr_layer.loss_base import Loss, Objective, SoftLoss, weighted_mean
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.pair import CloudPair
@@ -49,9 +50,11 @@ class SoftBBS(SoftLoss):
     def terms(self, match: str) -> SoftTerms:
         return SoftTerms(mean=False, outlier=self.outlier, match=match, feature_weight=self.feature_weight)
 
+    def distances(self, pair: CloudPair) -> Float[Tensor, "batch n m"]:
+        return point_to_point(pair, self.rounding(pair))
+
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
-        distances = point_to_point(pair, self.rounding(pair))
-        return -self.buddies(pair, distances, temperature).sum((-1, -2), dtype=torch.float64)
+        return -self.buddies(pair, self.distances(pair), temperature).sum((-1, -2), dtype=torch.float64)
 
 
 class SoftBD(SoftLoss):
@@ -64,8 +67,11 @@ class SoftBD(SoftLoss):
     def terms(self, match: str) -> SoftTerms:
         return SoftTerms(mean=True, outlier=self.outlier, match=match, feature_weight=self.feature_weight)
 
+    def distances(self, pair: CloudPair) -> Float[Tensor, "batch n m"]:
+        return point_to_point(pair, self.rounding(pair))
+
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
-        distances = point_to_point(pair, self.rounding(pair))
+        distances = self.distances(pair)
         return weighted_mean(distances, self.buddies(pair, distances, temperature))
 
 
@@ -101,10 +107,20 @@ class SoftBDNormals(SoftLoss):
     def terms(self, match: str) -> SoftTerms:
         return SoftTerms(True, True, self.align_signs, outlier=self.outlier, clip=self.clip)
 
-    def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
-        distances = symmetric_point_to_plane(pair, self.rounding(pair), self.align_signs)
+    def squares(self, pair: CloudPair) -> Squares:
         if self.clip is not None:
-            distances = torch.minimum(distances, _clipping_distance(distances.detach(), pair.pair_mask(), self.clip))
+            raise ValueError(f"clip is {self.clip}; GaussNewton cannot clip distances: clip=None, or inner=Adam()")
+        pair.both_normals()
+        return super().squares(pair)
+
+    def distances(self, pair: CloudPair) -> Float[Tensor, "batch n m"]:
+        distances = symmetric_point_to_plane(pair, self.rounding(pair), self.align_signs)
+        if self.clip is None:
+            return distances
+        return torch.minimum(distances, _clipping_distance(distances.detach(), pair.pair_mask(), self.clip))
+
+    def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
+        distances = self.distances(pair)
         return weighted_mean(distances, self.buddies(pair, distances, temperature))
 
 
@@ -130,6 +146,10 @@ class BuddyFilter(Loss):
         pair.both_normals()
         return MatchedKernel(MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask))
 
+    def squares(self, pair: CloudPair) -> Squares:
+        pair.both_normals()
+        return MatchedSquares(MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask))
+
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)
         still = RigidMotion.identity(pair.Q.shape[-1], pair.Q.shape[:1], device=pair.Q.device)
@@ -140,8 +160,8 @@ class BuddyFilter(Loss):
 
     def _matched(self, pair: CloudPair, temperature: Tensor, index: Tensor, mutual: Tensor) -> Tensor:
         P_normals, Q_normals = pair.both_normals()
-        normals = matched_plane_normals(_gathered(P_normals, index), Q_normals)
-        residual = ((pair.Q - _gathered(pair.P, index)) * normals).sum(-1)
+        normals = matched_plane_normals(gathered(P_normals, index), Q_normals)
+        residual = ((pair.Q - gathered(pair.P, index)) * normals).sum(-1)
         weights = mutual.to(residual.dtype)
         if pair.P_weights is not None:
             weights = weights * pair.P_weights.gather(1, index)
@@ -149,10 +169,6 @@ class BuddyFilter(Loss):
             weights = weights * pair.Q_weights
         distances = smooth_root(residual.square(), temperature.to(residual.dtype)[:, None])
         return weighted_mean(distances[:, None], weights[:, None])
-
-
-def _gathered(values: Tensor, index: Tensor) -> Tensor:
-    return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
 
 
 def _clipping_distance(distances: Tensor, mask: Tensor | None, deviations: float) -> Tensor:

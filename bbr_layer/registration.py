@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bbr_layer.distances import matched_plane_normals
 from bbr_layer.geometry import RigidMotion
+from bbr_layer.kernels.squares import point_rows
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.pair import CloudPair, Frame
 from bbr_layer.rotations import rotation_dimensions
@@ -91,25 +92,13 @@ def matched_information(pair: CloudPair, motion: RigidMotion, frame: Frame) -> t
     if pair.Q_weights is not None:
         weights = weights * pair.Q_weights
     if pair.P_normals is None or pair.Q_normals is None:
-        jacobian = _point_jacobian(arms)
+        jacobian = point_rows(arms)
     else:
         P_normals = pair.P_normals.gather(1, index[..., None].expand_as(pair.Q)).double()
         planes = matched_plane_normals(P_normals, motion.rotate(pair.Q_normals.double())) / 2
-        jacobian = (planes[:, :, None, :] @ _point_jacobian(arms)).squeeze(2)[:, :, None, :]
+        jacobian = (planes[:, :, None, :] @ point_rows(arms)).squeeze(2)[:, :, None, :]
     weighted = jacobian * weights[..., None, None]
     return mutual.sum(-1), torch.einsum("bnrk,bnrl->bkl", weighted, jacobian)
-
-
-def _point_jacobian(arms: Tensor) -> Tensor:
-    """d(moved point) / d(rotation, translation), ``(batch, m, d, k)``: ``[w cross arm, I]``."""
-    d = arms.shape[-1]
-    translation = torch.eye(d, dtype=arms.dtype, device=arms.device).expand(*arms.shape, d)
-    if d == 2:
-        rotation = torch.stack((-arms[..., 1], arms[..., 0]), -1)[..., None]
-    else:
-        axes = torch.eye(3, dtype=arms.dtype, device=arms.device).expand(*arms.shape, 3)
-        rotation = torch.linalg.cross(axes, arms[..., None, :].expand_as(axes), dim=-1).mT
-    return torch.cat((rotation, translation), dim=-1)
 
 
 @torch.no_grad()

@@ -9,10 +9,12 @@ from torch import Tensor, nn
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.charts import Chart, EulerAngles, RotationVector
+from bbr_layer.inner.gauss_newton import GaussNewton
 from bbr_layer.inner.implicit import attach, doubt
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.run import run
 from bbr_layer.inner.schedules import Constant, StepDown
+from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.inner.unroll import Problem, cut_from_graph, value
 from bbr_layer.loss_base import Loss, Objective
 from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD, SoftBDNormals
@@ -24,6 +26,9 @@ from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
 SOFT_SMOOTHING = 0.2
 # Converged: over the last tenth of the steps the pose moved the cloud by less than this share of a point spacing.
 SETTLED_MOVE = 0.1
+
+
+Inner = Adam | GaussNewton
 
 
 class StageResult(NamedTuple):
@@ -42,15 +47,19 @@ class Stage(nn.Module):
     Parameters
     ----------
     loss: one of the four, e.g. ``SoftBBS()``.
-    inner: ``Adam(...)``. Default ``Adam()``, 60 steps.
+    inner: ``Adam(...)`` (default ``Adam()``, 60 steps) or ``GaussNewton(...)``.
     temperature: ``Annealed(...)`` or ``Learned(...)``. Default ``Annealed()``, from 2 point spacings to 1.
     chart: ``RotationVector()`` (default; scale-free) or ``EulerAngles()`` (the paper's, in data units).
+
+    Raises
+    ------
+    ValueError: ``GaussNewton`` with a learned temperature or with Euler angles.
     """
 
     def __init__(
         self,
         loss: Loss,
-        inner: Adam | None = None,
+        inner: Inner | None = None,
         temperature: Temperature | None = None,
         chart: Chart | None = None,
     ):
@@ -59,6 +68,9 @@ class Stage(nn.Module):
         self.inner = Adam() if inner is None else inner
         self.temperature = Annealed() if temperature is None else temperature
         self.chart = RotationVector() if chart is None else chart
+        if isinstance(self.inner, GaussNewton) and (self.temperature.learned or not self.chart.scaled):
+            found = self.temperature if self.temperature.learned else self.chart
+            raise ValueError(f"{found!r} goes with Adam() alone: give GaussNewton() Annealed() and RotationVector()")
 
     def forward(
         self, pair: CloudPair, frame: Frame, start: RigidMotion, attached: Callable[[int], bool], closed_form: bool
@@ -93,7 +105,10 @@ class Stage(nn.Module):
             loss: Objective | PairKernel = PairKernel(self.loss.kernel(pair), pair, rounding)
         else:
             loss = self.loss.objective(pair)
-        return Problem(loss, self.chart, frame, self.temperature, unit, self.inner)
+        squares = None
+        if isinstance(self.inner, GaussNewton):
+            squares = BoundSquares(self.loss.squares(pair), pair, stored=not closed_form)
+        return Problem(loss, self.chart, frame, self.temperature, unit, self.inner, squares)
 
     def __repr__(self) -> str:
         return f"Stage({self.loss!r}, {self.inner!r}, {self.temperature!r}, {self.chart!r})"
@@ -113,7 +128,7 @@ def default_stages() -> list[Stage]:
     return [named_stage("softBBS"), named_stage("F")]
 
 
-def named_stage(name: str, inner: Adam | None = None, temperature: Temperature | None = None) -> Stage:
+def named_stage(name: str, inner: Inner | None = None, temperature: Temperature | None = None) -> Stage:
     """One scale-free stage by the paper's name of its loss: ``"softBBS"``, ``"softBD"``, ``"N"`` or ``"F"``.
 
     Raises

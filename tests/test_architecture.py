@@ -23,8 +23,8 @@ ORDER = {
         margins
         neighbours distances
         normals buddies temperature
-        kernels.scene
-        kernels.blocks kernels.forward_mode
+        kernels.scene kernels.squares
+        kernels.blocks kernels.forward_mode kernels.soft_squares
         kernels.reference kernels.matched kernels.gpu_pairs
         kernels.cpu_pairs kernels.cpu_matched kernels.gpu_sweeps kernels.gpu_clouds
         kernels.cpu_sweeps kernels.cpu_forces kernels.cpu_dual kernels.cpu_dual_forces kernels.gpu_forces
@@ -39,7 +39,8 @@ ORDER = {
         registration start door
         inner
         inner.schedules inner.charts inner.once
-        inner.adam inner.pose_gradient
+        inner.adam inner.pose_gradient inner.gauss_newton
+        inner.squares_step
         inner.unroll
         inner.compiled_scene inner.matched_scene inner.walk
         inner.run inner.implicit

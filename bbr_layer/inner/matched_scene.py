@@ -5,10 +5,9 @@ from torch import Tensor
 
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
 from bbr_layer.kernels.cpu_course import Adjoint
-from bbr_layer.kernels.cpu_matched import MatchedClouds, add_adjoint, add_weights, slope_of
+from bbr_layer.kernels.cpu_matched import add_adjoint, add_weights, matched_clouds, slope_of
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.pair import CloudPair
-from bbr_layer.trees import in_space
 
 
 class MatchedScene:
@@ -23,11 +22,7 @@ class MatchedScene:
 
     def __init__(self, kernel: MatchedKernel, pair: CloudPair, rounding: Tensor):
         self.search = kernel.search
-        vectors = (pair.P, pair.Q, *pair.both_normals())
-        tables = [in_space(x.detach().double().numpy()) for x in vectors]
-        for points, weights in ((pair.P, pair.P_weights), (pair.Q, pair.Q_weights)):
-            tables.append(np.ones(points.shape[:2]) if weights is None else weights.detach().double().numpy())
-        self.clouds = [MatchedClouds(*map(np.ascontiguousarray, item)) for item in zip(*tables, strict=True)]
+        self.clouds = matched_clouds(pair)
 
     def walk(self, number: int, course: Course, trace: Trace) -> None:
         """Take item ``number`` along all steps of the course."""

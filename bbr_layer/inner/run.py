@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.inner.adam import Moments
+from bbr_layer.inner.adam import Adam, Moments
 from bbr_layer.inner.charts import RotationVector, State
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.unroll import Problem, Progress, begin, detached, floor, share_done, step
@@ -67,7 +67,7 @@ def _advance(problem: Problem, at: Progress, steps: int, differentiable: bool) -
 def _look(problem: Problem) -> "Callable[[CloudPair, Tensor], Scene] | None":
     """What walks the steps without a tensor in between; None where nothing can."""
     loss, inner = problem.loss, problem.inner
-    if not isinstance(loss, PairKernel) or loss.pair.P.device.type != "cpu":
+    if not isinstance(inner, Adam) or not isinstance(loss, PairKernel) or loss.pair.P.device.type != "cpu":
         return None
     if problem.temperature.learned or inner.keep != "last" or not isinstance(problem.chart, RotationVector):
         return None
@@ -89,7 +89,7 @@ def _walked(problem: Problem, look: "Callable[[CloudPair, Tensor], Scene]", at: 
     from bbr_layer.inner.walk import Steps, walk
 
     loss, inner, done, d = problem.loss, problem.inner, at.moments.step, at.state.translation.shape[-1]
-    assert isinstance(loss, PairKernel)
+    assert isinstance(loss, PairKernel) and isinstance(inner, Adam)
     numbers = range(done, done + steps)
     shares = problem.unit.new_tensor([share_done(number, inner.steps) for number in numbers])[:, None]
     temperatures = torch.maximum(problem.temperature.at(shares, problem.unit), floor(problem))

@@ -9,7 +9,9 @@ from torch import Tensor
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam, Moments, adam_direction
 from bbr_layer.inner.charts import Chart, State, tangent_zero
+from bbr_layer.inner.gauss_newton import GaussNewton, shortened
 from bbr_layer.inner.pose_gradient import PairKernel
+from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.loss_base import Objective
 from bbr_layer.pair import Frame
 from bbr_layer.rotations import rotation_dimensions
@@ -24,7 +26,8 @@ class Problem(NamedTuple):
     frame: Frame
     temperature: Temperature
     unit: Tensor  # (batch,) float64, the spacing that temperatures are multiples of
-    inner: Adam
+    inner: Adam | GaussNewton
+    squares: BoundSquares | None = None  # the loss as GaussNewton sees it
 
 
 class Progress(NamedTuple):
@@ -64,8 +67,10 @@ def begin(problem: Problem, start: RigidMotion) -> Progress:
 
 
 def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
-    """One step of Adam on pose and, if it is learned, temperature; ``differentiable`` keeps the graph."""
+    """One step on pose and, if it is learned, temperature; ``differentiable`` keeps the graph."""
     inner, learned = problem.inner, problem.temperature.learned
+    if isinstance(inner, GaussNewton):
+        return _gauss_newton_step(problem, inner, at)
     temperature = at.temperature
     if not learned:
         temperature = problem.temperature.at(share_done(at.moments.step, inner.steps), problem.unit)
@@ -88,6 +93,20 @@ def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
         torch.where(better, loss, at.best_loss),
         _chosen(better, at.state, at.best_state),
         torch.where(better, temperature, at.best_temperature),
+    )
+
+
+def _gauss_newton_step(problem: Problem, inner: GaussNewton, at: Progress) -> Progress:
+    assert problem.squares is not None
+    cooled = problem.temperature.at(share_done(at.moments.step, inner.steps), problem.unit)
+    temperature = torch.maximum(cooled, floor(problem))
+    motion = problem.chart.motion(at.state, problem.frame)
+    step, slope = problem.squares.step(motion, temperature, inner.damping)
+    return at._replace(
+        state=problem.chart.moved(at.state, shortened(step, motion.dimension)),
+        temperature=temperature,
+        moments=at.moments._replace(step=at.moments.step + 1),
+        gradient_norm=slope.detach().norm(dim=-1),
     )
 
 
@@ -118,7 +137,8 @@ def cut_from_graph(problem: Problem, plain: Callable[[], Objective]) -> Problem:
     """The same problem with every input cut from the graph; ``plain`` makes a function to differentiate anew."""
     loss = problem.loss.detach() if isinstance(problem.loss, PairKernel) else plain()
     frame = Frame(*(field.detach() for field in problem.frame))
-    return problem._replace(loss=loss, frame=frame, unit=problem.unit.detach())
+    squares = None if problem.squares is None else problem.squares.detach()
+    return problem._replace(loss=loss, frame=frame, unit=problem.unit.detach(), squares=squares)
 
 
 def value(problem: Problem, motion: RigidMotion, temperature: Tensor) -> Tensor:

@@ -6,6 +6,8 @@ import numpy as np
 
 from bbr_layer.kernels.cpu_math import compiled
 from bbr_layer.kernels.cpu_turns import apply, cross
+from bbr_layer.pair import CloudPair
+from bbr_layer.trees import in_space
 
 # Directions of a further turn and shift of the pose.
 TANGENT = 6
@@ -20,6 +22,15 @@ class MatchedClouds(NamedTuple):
     Q_normals: np.ndarray
     P_weights: np.ndarray
     Q_weights: np.ndarray
+
+
+def matched_clouds(pair: CloudPair) -> list[MatchedClouds]:
+    """Each item of a pair with normals; of the plane, embedded in space."""
+    vectors = (pair.P, pair.Q, *pair.both_normals())
+    tables = [in_space(x.detach().double().numpy()) for x in vectors]
+    for points, weights in ((pair.P, pair.P_weights), (pair.Q, pair.Q_weights)):
+        tables.append(np.ones(points.shape[:2]) if weights is None else weights.detach().double().numpy())
+    return [MatchedClouds(*map(np.ascontiguousarray, item)) for item in zip(*tables, strict=True)]
 
 
 @compiled()
@@ -78,6 +89,33 @@ def slope_of(clouds, pairs, pose, temperature):  # type: ignore[no-untyped-def]
                 slope[k] += push * torque[k]
                 slope[3 + k] += push * plane[k]
     return slope
+
+
+@compiled()
+def equations_of(clouds, pairs, pose, temperature):  # type: ignore[no-untyped-def]
+    """Normal equations of a Gauss-Newton step, ``(6, 6)`` and ``(6,)``; see ``MatchedSquares``."""
+    index, mutual = pairs
+    matrix, slope, row = np.zeros((TANGENT, TANGENT)), np.zeros(TANGENT), np.empty(TANGENT)
+    scale = _scale(clouds, index, mutual)
+    for j in range(len(index)):
+        if not mutual[j]:
+            continue
+        i = index[j]
+        arm, turned, offset, plane, _ = _place(clouds, i, j, pose)
+        residual = _dot(offset, plane)
+        squared = residual * residual + temperature * temperature
+        pull = scale * clouds.P_weights[i] * clouds.Q_weights[j] / (np.sqrt(squared) if squared > 0 else 1.0)
+        torque = _combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
+        for k in range(3):
+            row[k], row[3 + k] = torque[k], plane[k]
+        for k in range(TANGENT):
+            slope[k] += pull * residual * row[k]
+            for other in range(k + 1):
+                matrix[k, other] += pull * row[k] * row[other]
+    for k in range(TANGENT):
+        for other in range(k):
+            matrix[other, k] = matrix[k, other]
+    return matrix, slope
 
 
 @compiled()
