@@ -76,13 +76,13 @@ class MutualMargins:
 
     Parameters
     ----------
-    P, Q: ``(n, d)`` and ``(m, d)``, at least one point each.
+    P, Q: trees over the two clouds.
     kept: False looks everything up at every asking.
     """
 
-    def __init__(self, P: Float[np.ndarray, "n d"], Q: Float[np.ndarray, "m d"], kept: bool):
-        self.forth = Margins(Tree(P), in_space(Q), kept)
-        self.back = Margins(Tree(Q), in_space(P), kept)
+    def __init__(self, P: Tree, Q: Tree, kept: bool):
+        self.forth = Margins(P, in_space(Q.points), kept)
+        self.back = Margins(Q, in_space(P.points), kept)
 
     def __call__(self, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
         """For each point of Q the nearest of P with Q carried by ``pose``, and whether the choice is mutual.

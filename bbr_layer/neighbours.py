@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from bbr_layer.cloud_trees import tree_of
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.margins import Margins, MutualMargins, Pose
 from bbr_layer.trees import Tree, in_space
@@ -42,10 +42,9 @@ class MutualNeighbours:
         margins: bool = True,
     ):
         self.P_rows, self.Q_rows = _rows(P, P_mask), _rows(Q, Q_mask)
-        clouds = zip(_real(P.detach(), self.P_rows), _real(Q.detach(), self.Q_rows), strict=True)
         self.shape, self.device = Q.shape[:2], Q.device
         # None where a cloud has no real point.
-        self.items: list[MutualMargins | _Tiled | None] = [self._item(p, q, margins) for p, q in clouds]
+        self.items: list[MutualMargins | _Tiled | None] = [self._item(P, Q, b, margins) for b in range(len(P))]
 
     @property
     def asked(self) -> int:
@@ -112,13 +111,15 @@ class MutualNeighbours:
             mutual[rows] = both
         return nearest, mutual
 
-    @staticmethod
-    def _item(P: Tensor, Q: Tensor, margins: bool) -> "MutualMargins | _Tiled | None":
-        if not len(P) or not len(Q):
+    def _item(self, P: Tensor, Q: Tensor, number: int, margins: bool) -> "MutualMargins | _Tiled | None":
+        sides = (P, self.P_rows[number]), (Q, self.Q_rows[number])
+        if not all(points.shape[1] if rows is None else len(rows) for points, rows in sides):
             return None
         if P.device.type == "cpu":
-            return MutualMargins(P.double().numpy(), Q.double().numpy(), margins)
-        return _Tiled(P, Q)
+            trees = [_tree(points, number, rows) for points, rows in sides]
+            return MutualMargins(trees[0], trees[1], margins)
+        clouds = [_real(points.detach()[number], rows) for points, rows in sides]
+        return _Tiled(clouds[0], clouds[1])
 
     def _sides(self) -> "Iterator[Margins | _Tiled]":
         for item in self.items:
@@ -133,10 +134,14 @@ def _rows(points: Tensor, mask: Tensor | None) -> list[np.ndarray | None]:
     return [None if mask is None else mask[b].nonzero()[:, 0].cpu().numpy() for b in range(len(points))]
 
 
-def _real(points: Tensor, rows: list[np.ndarray | None]) -> Iterator[Tensor]:
-    """Each item's real points."""
-    for item, kept in zip(points, rows, strict=True):
-        yield item if kept is None else item[torch.from_numpy(kept).to(item.device)]
+def _real(item: Tensor, rows: np.ndarray | None) -> Tensor:
+    """An item's real points."""
+    return item if rows is None else item[torch.from_numpy(rows).to(item.device)]
+
+
+def _tree(points: Tensor, number: int, rows: np.ndarray | None) -> Tree:
+    """Over the real points of an item; one for all who ask where that is all of them."""
+    return tree_of(points, number) if rows is None else Tree(points[number].detach().double().numpy()[rows])
 
 
 class _Tiled:
@@ -160,36 +165,3 @@ def nearest_by_tiles(queries: Float[Tensor, "k d"], points: Float[Tensor, "n d"]
     """Index of the nearest point for each query, the first of equally near ones."""
     rows = max(1, PAIRS_PER_TILE // len(points))
     return torch.cat([(tile[:, None, :] - points).square().sum(-1).argmin(1) for tile in queries.split(rows)])
-
-
-def nearest_neighbours(
-    points: Float[Tensor, "batch n d"],
-    count: int,
-    mask: Bool[Tensor, "batch n"] | None = None,
-) -> Int[Tensor, "batch n k"]:
-    """The ``count`` nearest points of each point within its own cloud, itself first, ``(batch, n, count)``.
-
-    Where a cloud has fewer real points than ``count``, the last ones found are repeated. Padded points get
-    neighbours like any other (their rows mean nothing).
-    """
-    points = points.detach()
-    everything = torch.ones_like(points[..., 0], dtype=torch.bool) if mask is None else mask
-    found = [neighbours_of(item, item[real], count) for item, real in zip(points, everything, strict=True)]
-    kept = [real.nonzero()[:, 0] for real in everything]
-    return torch.stack([i if not len(k) else k[i] for i, k in zip(found, kept, strict=True)])
-
-
-def neighbours_of(queries: Float[Tensor, "k d"], points: Float[Tensor, "n d"], count: int) -> Int[Tensor, "k count"]:
-    """The ``count`` nearest of ``points`` for each query, near to far, in any number of dimensions.
-
-    Where there are fewer points than ``count`` the last ones found are repeated; without any, the indices are 0.
-    """
-    if not len(points):
-        return torch.zeros(len(queries), count, dtype=torch.int64, device=points.device)
-    searched, asked = points.detach().cpu().double().numpy(), queries.detach().cpu().double().numpy()
-    enough = min(count, len(points))
-    if points.shape[1] in (2, 3):
-        index = Tree(searched).candidates(asked, enough)[1]
-    else:
-        index = cKDTree(searched).query(asked, k=list(range(1, enough + 1)))[1]
-    return torch.from_numpy(np.pad(index, ((0, 0), (0, count - enough)), mode="edge")).to(points.device)

@@ -5,7 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bbr_layer.distances import smooth_root
-from bbr_layer.neighbours import nearest_neighbours, neighbours_of
+from bbr_layer.neighbourhoods import known_tree, nearest_neighbours, neighbours_of
+from bbr_layer.trees import Tree
 
 # Neighbours (the point itself included) of the plane fit when normals are not given. Measured: 8 of the sparse
 # cloud's own points beat 13 (the paper's number, meant for the full cloud) on the bunny at 500 to 1000 points.
@@ -48,7 +49,7 @@ def estimate_normals(
     batch, (n, d) = points.shape[:-2], points.shape[-2:]
     if neighbours < d:
         raise ValueError(f"neighbours is {neighbours}; a normal in {d}D needs at least {d}: try {NORMAL_NEIGHBOURS}")
-    flat = points.reshape(-1, n, d)
+    flat = points if len(batch) == 1 else points.reshape(-1, n, d)
     real = None if mask is None else mask.reshape(-1, n)
     index = nearest_neighbours(flat, neighbours, real)
     around = torch.take_along_dim(flat[:, None], index[..., None], dim=2).double()
@@ -95,19 +96,21 @@ def point_spacing(
     1.0
     """
     batch, (n, d) = points.shape[:-2], points.shape[-2:]
-    flat = points.reshape(-1, n, d)
-    real = [None] * len(flat) if mask is None else list(mask.reshape(-1, n))
-    items = [_item_spacing(item if kept is None else item[kept]) for item, kept in zip(flat, real, strict=True)]
+    flat = points if len(batch) == 1 else points.reshape(-1, n, d)
+    if mask is None:
+        items = [_item_spacing(item, known_tree(flat, b)) for b, item in enumerate(flat)]
+    else:
+        items = [_item_spacing(item[kept]) for item, kept in zip(flat, mask.reshape(-1, n), strict=True)]
     return torch.stack(items).reshape(batch) if items else points.new_zeros(batch, dtype=torch.float64)
 
 
-def _item_spacing(points: Float[Tensor, "n d"]) -> Float[Tensor, ""]:
+def _item_spacing(points: Float[Tensor, "n d"], tree: Tree | None = None) -> Float[Tensor, ""]:
     """``point_spacing`` of one cloud without padding."""
     n, asked = len(points), min(len(points), SPACING_POINTS)
     if not n:
         return points.new_zeros((), dtype=torch.float64)
     some = points[torch.arange(asked, device=points.device) * n // asked]
-    index = neighbours_of(some, points, SPACING_NEIGHBOURS + 1)[..., 1:]
+    index = neighbours_of(some, points, SPACING_NEIGHBOURS + 1, tree)[..., 1:]
     squared = (points[index].double() - some[:, None].double()).square().sum(-1)
     distinct = squared.detach() > 0
     first = distinct.to(torch.int8).argmax(-1, keepdim=True)  # the nearest neighbour that is not a duplicate

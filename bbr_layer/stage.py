@@ -20,12 +20,15 @@ from bbr_layer.loss_base import Loss, Objective
 from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD, SoftBDNormals
 from bbr_layer.pair import CloudPair, Frame, centre_and_radius
 from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
+from bbr_layer.thinning import thinned_pair
 
 # Rounding of soft distances at zero, in point spacings: the measured value at which the unrolled gradient of an exact
 # copy equals finite differences; 0.001 leaves it at 1e2 to 1e5.
 SOFT_SMOOTHING = 0.2
 # Converged: over the last tenth of the steps the pose moved the cloud by less than this share of a point spacing.
 SETTLED_MOVE = 0.1
+# What a stage must see at least: a plane has three, and one more shows its other side.
+FEWEST_POINTS = 4
 
 
 Inner = Adam | GaussNewton
@@ -50,10 +53,12 @@ class Stage(nn.Module):
     inner: ``Adam(...)`` (default ``Adam()``, 60 steps) or ``GaussNewton(...)``.
     temperature: ``Annealed(...)`` or ``Learned(...)``. Default ``Annealed()``, from 2 point spacings to 1.
     chart: ``RotationVector()`` (default; scale-free) or ``EulerAngles()`` (the paper's, in data units).
+    points: most points of each cloud that the stage sees, spread evenly in space. Default None, all of them.
+    above: the stage is left out where neither cloud has more points than this. Default 0, never.
 
     Raises
     ------
-    ValueError: ``GaussNewton`` with a learned temperature or with Euler angles.
+    ValueError: ``GaussNewton`` with a learned temperature or with Euler angles; hardly any ``points``.
     """
 
     def __init__(
@@ -62,12 +67,18 @@ class Stage(nn.Module):
         inner: Inner | None = None,
         temperature: Temperature | None = None,
         chart: Chart | None = None,
+        *,
+        points: int | None = None,
+        above: int = 0,
     ):
         super().__init__()
+        if points is not None and points < FEWEST_POINTS:
+            raise ValueError(f"points is {points}; a stage needs at least {FEWEST_POINTS} of each cloud: try 1000")
         self.loss = loss
         self.inner = Adam() if inner is None else inner
         self.temperature = Annealed() if temperature is None else temperature
         self.chart = RotationVector() if chart is None else chart
+        self.points, self.above = points, above
         if isinstance(self.inner, GaussNewton) and (self.temperature.learned or not self.chart.scaled):
             found = self.temperature if self.temperature.learned else self.chart
             raise ValueError(f"{found!r} goes with Adam() alone: give GaussNewton() Annealed() and RotationVector()")
@@ -80,6 +91,7 @@ class Stage(nn.Module):
         ``attached(step)`` says which steps keep a graph; ``closed_form`` takes gradients from the kernels instead of
         differentiating the loss.
         """
+        pair = thinned_pair(pair, self.points)
         problem = self._problem(pair, frame, closed_form)
         cut = cut_from_graph(problem, lambda: self.loss.objective(pair.detach()))
         end, earlier = run(problem, start, attached, cut)
@@ -92,6 +104,7 @@ class Stage(nn.Module):
 
     def attach(self, pair: CloudPair, frame: Frame, ended: StageResult, damping: float) -> tuple[StageResult, str]:
         """The result with the derivative of an optimum, and in words why it may not be one; "" if it is."""
+        pair = thinned_pair(pair, self.points)
         problem = self._problem(pair, frame, closed_form=True)
         temperature = (ended.temperature / frame.scale).detach()
         attached = attach(problem, pair, ended.motion, temperature, damping)
@@ -111,7 +124,9 @@ class Stage(nn.Module):
         return Problem(loss, self.chart, frame, self.temperature, unit, self.inner, squares)
 
     def __repr__(self) -> str:
-        return f"Stage({self.loss!r}, {self.inner!r}, {self.temperature!r}, {self.chart!r})"
+        sizes = "" if self.points is None else f", points={self.points}"
+        sizes += "" if not self.above else f", above={self.above}"
+        return f"Stage({self.loss!r}, {self.inner!r}, {self.temperature!r}, {self.chart!r}{sizes})"
 
 
 @torch.no_grad()

@@ -21,7 +21,8 @@ ORDER = {
         kernels.cpu_walk kernels.cpu_turns
         kernels.cpu_adam
         margins
-        neighbours distances
+        cloud_trees
+        neighbours neighbourhoods distances
         normals buddies temperature
         kernels.scene kernels.squares
         kernels.blocks kernels.forward_mode kernels.soft_squares
@@ -45,6 +46,7 @@ ORDER = {
         inner.compiled_scene inner.matched_scene inner.walk
         inner.run inner.implicit
         backward transforms preparation
+        thinning
         stage
         starts
         layer

@@ -10,7 +10,8 @@ from problems import motion, noisy_pair, unit
 from torch import Tensor
 
 from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals, margins
-from bbr_layer.neighbours import MutualNeighbours, nearest_by_tiles, nearest_neighbours
+from bbr_layer.neighbourhoods import nearest_neighbours
+from bbr_layer.neighbours import MutualNeighbours, nearest_by_tiles
 from bbr_layer.normals import SPACING_POINTS, point_spacing
 
 

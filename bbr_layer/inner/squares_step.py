@@ -79,9 +79,8 @@ class _Step(torch.autograd.Function):
         saved = ctx.saved_tensors
         with torch.enable_grad():
             given = [None if x is None else x.detach().requires_grad_(x.is_floating_point()) for x in saved]
-            temperature, rotation, translation, *fields = given
-            motion, pair = RigidMotion(rotation, translation), CloudPair._make(fields)
-            step = solved(ctx.bound.squares.equations(pair, motion, temperature, ctx.held), ctx.damping)
+            motion, pair = RigidMotion._make(given[1:3]), CloudPair._make(given[3:])
+            step = solved(ctx.bound.squares.equations(pair, motion, given[0], ctx.held), ctx.damping)
         wanted = [x for x in given if x is not None and x.requires_grad]
         found = iter(torch.autograd.grad(step, wanted, cotangent.detach(), allow_unused=True))
         answers = [next(found) if x is not None and x.requires_grad else None for x in given]

@@ -1,6 +1,6 @@
 """The normal equations of a loss over soft buddies: every pair pulls, as much as it is a buddy."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from bbr_layer.kernels.squares import Equations, cross, or_one, plane_rows, poin
 from bbr_layer.pair import CloudPair
 
 
+@runtime_checkable
 class SoftMatching(Protocol):
     """How a soft loss sees a pair whose source has been moved."""
 

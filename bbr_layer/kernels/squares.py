@@ -6,7 +6,7 @@ gradient that of the loss (iteratively reweighted least squares; Holland and Wel
 ``sum(c J J^T) x = -sum(c r J)`` for the turn and shift x of the pose.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -25,6 +25,7 @@ class Equations(NamedTuple):
     slope: Tensor
 
 
+@runtime_checkable
 class Squares(Protocol):
     """The normal equations of one loss."""
 
