@@ -9,10 +9,11 @@ from torch import Tensor, nn
 from bbr_layer.backward import Backward, Detached, Implicit, Replay, speak_up
 from bbr_layer.door import batch_shape, checked_pair, checked_start
 from bbr_layer.geometry import RigidMotion
+from bbr_layer.named_stages import default_stages, named_stage, paper_stage
 from bbr_layer.pair import CloudPair, Frame
 from bbr_layer.preparation import begun_at, prepared
 from bbr_layer.registration import Registration, judge, matched_information
-from bbr_layer.stage import Inner, Stage, StageResult, default_stages, named_stage, paper_stage
+from bbr_layer.stage import Inner, Stage, StageResult
 from bbr_layer.starts import best_start
 from bbr_layer.temperature import Temperature
 from bbr_layer.transforms import is_transformed, registered

@@ -48,7 +48,7 @@ ORDER = {
         backward transforms preparation
         thinning
         stage
-        starts
+        named_stages starts
         layer
         atomic cloud_columns
         cloud_tables cloud_formats cloud_writing trajectories

@@ -19,7 +19,7 @@ from bbr_layer import (
     Stage,
     Truncated,
 )
-from bbr_layer.stage import named_stage
+from bbr_layer.named_stages import named_stage
 
 NAMES = ["softBBS", "softBD", "N", "F"]
 STEPS = 4

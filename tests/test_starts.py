@@ -8,8 +8,8 @@ from problems import bumpy
 
 from bbr_layer import BBRLayer, CloudPair, Detached, RigidMotion, angular_error
 from bbr_layer.inner.adam import Adam
+from bbr_layer.named_stages import named_stage
 from bbr_layer.preparation import prepared
-from bbr_layer.stage import named_stage
 from bbr_layer.starts import HOT, TURN, best_start, most_starts, turns
 
 
