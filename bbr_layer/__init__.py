@@ -33,10 +33,10 @@ from bbr_layer.losses import SoftBBS as SoftBBS
 from bbr_layer.losses import SoftBD as SoftBD
 from bbr_layer.losses import SoftBDNormals as SoftBDNormals
 from bbr_layer.normals import estimate_normals as estimate_normals
-from bbr_layer.normals import point_spacing as point_spacing
 from bbr_layer.pair import CloudPair as CloudPair
 from bbr_layer.registration import Registration as Registration
 from bbr_layer.registration import Status as Status
+from bbr_layer.spacing import point_spacing as point_spacing
 from bbr_layer.stage import Stage as Stage
 from bbr_layer.temperature import Annealed as Annealed
 from bbr_layer.temperature import Learned as Learned

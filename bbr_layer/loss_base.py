@@ -15,8 +15,8 @@ from bbr_layer.kernels.scene import Kernel, SoftTerms
 from bbr_layer.kernels.soft import SoftKernel
 from bbr_layer.kernels.soft_squares import SoftSquares
 from bbr_layer.kernels.squares import Squares
-from bbr_layer.normals import point_spacing
 from bbr_layer.pair import CloudPair
+from bbr_layer.spacing import point_spacing
 
 Objective = Callable[[RigidMotion, Tensor], Tensor]
 

@@ -14,8 +14,8 @@ from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.scene import Kernel, SoftTerms
 from bbr_layer.kernels.squares import MatchedSquares, Squares, gathered
 from bbr_layer.loss_base import Loss, Objective, SoftLoss, weighted_mean
-from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.pair import CloudPair
+from bbr_layer.searches import search_of
 
 
 class SoftBBS(SoftLoss):
@@ -135,7 +135,7 @@ class BuddyFilter(Loss):
     needs_normals = True
 
     def objective(self, pair: CloudPair) -> Objective:
-        search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)
+        search = search_of(pair)
 
         def evaluate(motion: RigidMotion, temperature: Tensor) -> Tensor:
             return self._matched(pair.moved_by(motion), temperature, *search(motion))
@@ -144,14 +144,14 @@ class BuddyFilter(Loss):
 
     def kernel(self, pair: CloudPair) -> Kernel:
         pair.both_normals()
-        return MatchedKernel(MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask))
+        return MatchedKernel(search_of(pair))
 
     def squares(self, pair: CloudPair) -> Squares:
         pair.both_normals()
-        return MatchedSquares(MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask))
+        return MatchedSquares(search_of(pair))
 
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
-        search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)
+        search = search_of(pair)
         still = RigidMotion.identity(pair.Q.shape[-1], pair.Q.shape[:1], device=pair.Q.device)
         return self._matched(pair, temperature, *search(still))
 

@@ -23,15 +23,15 @@ def nearest_neighbours(
     if mask is None and count <= LISTED:
         trees = [known_tree(points, b) for b in range(len(points))]
         if trees and all(trees):
-            return torch.stack([_listed(tree, count) for tree in trees if tree is not None])
+            return torch.stack([listed(tree, count) for tree in trees if tree is not None])
     everything = torch.ones_like(points[..., 0], dtype=torch.bool) if mask is None else mask
     found = [neighbours_of(item, item[real], count) for item, real in zip(points, everything, strict=True)]
     kept = [real.nonzero()[:, 0] for real in everything]
     return torch.stack([i if not len(k) else k[i] for i, k in zip(found, kept, strict=True)])
 
 
-def _listed(tree: Tree, count: int) -> Int[Tensor, "n count"]:
-    """The same for all points of a tree, from lists that it may be asked for again."""
+def listed(tree: Tree, count: int) -> Int[Tensor, "n count"]:
+    """The same for all points of a tree, from the lists that it keeps."""
     index = tree.lists()[1][:, :count].astype(np.int64)
     return torch.from_numpy(np.pad(index, ((0, 0), (0, count - index.shape[1])), mode="edge"))
 

@@ -129,6 +129,22 @@ class MutualNeighbours:
                 yield item
 
 
+def nearest_points(
+    P: Float[Tensor, "batch n d"], queries: Float[Tensor, "batch k d"], P_mask: Bool[Tensor, "batch n"] | None = None
+) -> Int[Tensor, "batch k"]:
+    """Index of each query's nearest point of P, one way only; 0 where P has no real point."""
+    found = torch.zeros(queries.shape[:2], dtype=torch.int64, device=P.device)
+    for number, rows in enumerate(_rows(P, P_mask)):
+        if not (P.shape[1] if rows is None else len(rows)):
+            continue
+        if P.device.type == "cpu":
+            index = torch.from_numpy(_tree(P, number, rows).nearest(queries[number].double().numpy())[0])
+        else:
+            index = nearest_by_tiles(queries[number], _real(P[number], rows).to(queries.dtype))
+        found[number] = index if rows is None else torch.from_numpy(rows).to(P.device)[index]
+    return found
+
+
 def _rows(points: Tensor, mask: Tensor | None) -> list[np.ndarray | None]:
     """Each item's rows that are real, None where all are."""
     return [None if mask is None else mask[b].nonzero()[:, 0].cpu().numpy() for b in range(len(points))]

@@ -1,23 +1,16 @@
-"""Local geometry of one cloud: normals and point spacing, both differentiable in the coordinates."""
+"""The normals of a cloud, differentiable in its coordinates."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bbr_layer.distances import smooth_root
-from bbr_layer.neighbourhoods import known_tree, nearest_neighbours, neighbours_of
-from bbr_layer.trees import Tree
+from bbr_layer.neighbourhoods import nearest_neighbours
 
 # Neighbours (the point itself included) of the plane fit when normals are not given. Measured: 8 of the sparse
 # cloud's own points beat 13 (the paper's number, meant for the full cloud) on the bunny at 500 to 1000 points.
 NORMAL_NEIGHBOURS = 8
 # Two eigenvalues closer than this share of the largest leave the normal undetermined: its gradient is then 0.
 EIGENVALUE_GAP = 1e-6
-# Nearest neighbours searched for one that is not a duplicate of the point itself.
-SPACING_NEIGHBOURS = 4
-# Points of a cloud, evenly over its order, whose spacing is measured (against the whole cloud): the median of 4096
-# differs from that of a lidar scan's 120 000 by 1 percent.
-SPACING_POINTS = 4096
 
 
 def estimate_normals(
@@ -82,39 +75,3 @@ def _outward(normals: Tensor, points: Tensor, mask: Tensor | None) -> Tensor:
     centre = (points * real).sum(-2, keepdim=True) / real.sum(-2, keepdim=True).clamp(min=1.0)
     side = ((points - centre) * normals).detach().sum(-1, keepdim=True)
     return torch.where(side < 0, -1.0, 1.0).to(points.dtype)
-
-
-def point_spacing(
-    points: Float[Tensor, "*batch n d"], mask: Bool[Tensor, "*batch n"] | None = None
-) -> Float[Tensor, "*batch"]:
-    """Median distance from a point to its nearest distinct neighbour, ``(*batch,)`` float64, in the data's unit.
-
-    Exact duplicates are looked past; a cloud whose real points all coincide, or a single point, has spacing 0.
-    Works in any number of dimensions, so features have a spacing too.
-
-    >>> point_spacing(torch.tensor([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]])).item()
-    1.0
-    """
-    batch, (n, d) = points.shape[:-2], points.shape[-2:]
-    flat = points if len(batch) == 1 else points.reshape(-1, n, d)
-    if mask is None:
-        items = [_item_spacing(item, known_tree(flat, b)) for b, item in enumerate(flat)]
-    else:
-        items = [_item_spacing(item[kept]) for item, kept in zip(flat, mask.reshape(-1, n), strict=True)]
-    return torch.stack(items).reshape(batch) if items else points.new_zeros(batch, dtype=torch.float64)
-
-
-def _item_spacing(points: Float[Tensor, "n d"], tree: Tree | None = None) -> Float[Tensor, ""]:
-    """``point_spacing`` of one cloud without padding."""
-    n, asked = len(points), min(len(points), SPACING_POINTS)
-    if not n:
-        return points.new_zeros((), dtype=torch.float64)
-    some = points[torch.arange(asked, device=points.device) * n // asked]
-    index = neighbours_of(some, points, SPACING_NEIGHBOURS + 1, tree)[..., 1:]
-    squared = (points[index].double() - some[:, None].double()).square().sum(-1)
-    distinct = squared.detach() > 0
-    first = distinct.to(torch.int8).argmax(-1, keepdim=True)  # the nearest neighbour that is not a duplicate
-    usable = distinct.any(-1)
-    distance = smooth_root(squared.gather(-1, first)[..., 0])
-    median = torch.where(usable, distance, torch.nan).nanmedian()
-    return torch.where(usable.any(), median, 0.0)

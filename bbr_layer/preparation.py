@@ -2,11 +2,10 @@
 
 import logging
 
-import torch
-
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.normals import estimate_normals, point_spacing
+from bbr_layer.normals import estimate_normals
 from bbr_layer.pair import CloudPair, Frame, into_frame
+from bbr_layer.spacing import with_spacing
 from bbr_layer.start import better_start
 
 LOGGER = logging.getLogger("bbr_layer")
@@ -15,17 +14,13 @@ LOGGER = logging.getLogger("bbr_layer")
 def prepared(given: CloudPair, needs_normals: bool, scaled: bool) -> tuple[Frame, CloudPair]:
     """The pair centred (and ``scaled``), with its spacing and, where a loss needs them, its normals."""
     frame, pair = into_frame(given, scaled)
-    spacing = (point_spacing(pair.P, pair.P_mask) + point_spacing(pair.Q, pair.Q_mask)) / 2
-    pair = pair._replace(spacing=torch.where(spacing > 0, spacing, 1.0))
-    if not needs_normals:
-        return frame, pair
-    if pair.P_normals is None or pair.Q_normals is None:
+    if needs_normals and (pair.P_normals is None or pair.Q_normals is None):
         LOGGER.info("normals were not given and are estimated from the clouds themselves")
-    if pair.P_normals is None:
-        pair = pair._replace(P_normals=estimate_normals(pair.P, mask=pair.P_mask))
-    if pair.Q_normals is None:
-        pair = pair._replace(Q_normals=estimate_normals(pair.Q, mask=pair.Q_mask))
-    return frame, pair
+        if pair.P_normals is None:
+            pair = pair._replace(P_normals=estimate_normals(pair.P, mask=pair.P_mask))
+        if pair.Q_normals is None:
+            pair = pair._replace(Q_normals=estimate_normals(pair.Q, mask=pair.Q_mask))
+    return frame, with_spacing(pair)
 
 
 def begun_at(start: RigidMotion | None, pair: CloudPair, frame: Frame, scaled: bool) -> RigidMotion:

@@ -10,9 +10,9 @@ from torch import Tensor
 from bbr_layer.distances import matched_plane_normals
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.squares import point_rows
-from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.pair import CloudPair, Frame
 from bbr_layer.rotations import rotation_dimensions
+from bbr_layer.searches import search_of
 
 # Degenerate: the weakest direction holds less than this share of the mean information. A plane sliding on a plane has
 # 0 up to noise; a room scanned from inside about 0.1.
@@ -84,7 +84,7 @@ class Registration(NamedTuple):
 @torch.no_grad()
 def matched_information(pair: CloudPair, motion: RigidMotion, frame: Frame) -> tuple[Tensor, Tensor]:
     """How many mutual pairs there are, ``(batch,)``, and their Gauss-Newton Hessian ``(batch, k, k)`` in data units."""
-    index, mutual = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)(motion)
+    index, mutual = search_of(pair)(motion)
     arms = motion.rotate(pair.Q.to(motion.rotation.dtype)) * frame.scale[:, None, None]
     weights = mutual.double()
     if pair.P_weights is not None:

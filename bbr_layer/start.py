@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.neighbours import MutualNeighbours
+from bbr_layer.neighbours import nearest_points
 from bbr_layer.pair import CloudPair, Frame
 
 # Distances beyond a few of these many point spacings count as no match at all when two starts are compared.
@@ -31,9 +31,10 @@ def _misfit(pair: CloudPair, motion: RigidMotion) -> Tensor:
     """Mean Geman-McClure distance from a thinned source to its nearest targets, ``(batch,)`` in [0, 1]."""
     stride = max(1, pair.Q.shape[1] // COMPARISON_POINTS)
     Q, mask = pair.Q[:, ::stride], None if pair.Q_mask is None else pair.Q_mask[:, ::stride]
-    index, _ = MutualNeighbours(pair.P, Q, pair.P_mask, mask)(motion)
+    moved = motion(Q)
+    index = nearest_points(pair.P, moved, pair.P_mask)
     nearest = pair.P.gather(1, index[..., None].expand(-1, -1, pair.P.shape[-1]))
-    squared = (motion(Q) - nearest).double().square().sum(-1)
+    squared = (moved - nearest).double().square().sum(-1)
     width = (COMPARISON_SPACINGS * pair.known_spacing().double()[:, None]).square()
     share = squared / (squared + width)
     weights = torch.ones_like(share) if mask is None else mask.double()

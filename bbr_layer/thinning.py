@@ -5,8 +5,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bbr_layer.normals import point_spacing
 from bbr_layer.pair import CloudPair
+from bbr_layer.spacing import with_spacing
 
 # Grids tried: a surface has as many occupied cells as the square of their inverse size, so that each guess is near.
 GUESSES = 6
@@ -55,9 +55,7 @@ def thinned_pair(pair: CloudPair, most: int | None) -> CloudPair:
         index, real = rows
         fields |= {name: _taken(getattr(pair, name), index) for name in (side, *_companions(side))}
         fields[f"{side}_mask"] = None if bool(real.all()) else real
-    thin = CloudPair(**{**pair._asdict(), **fields})
-    spacing = (point_spacing(thin.P, thin.P_mask) + point_spacing(thin.Q, thin.Q_mask)) / 2
-    return thin._replace(spacing=torch.where(spacing > 0, spacing, 1.0))
+    return with_spacing(CloudPair(**{**pair._asdict(), **fields}))
 
 
 def _companions(side: str) -> list[str]:

@@ -33,6 +33,11 @@ class Tree:
     def __len__(self) -> int:
         return len(self.points) if self.kept is None else len(self.kept)
 
+    @property
+    def listed(self) -> bool:
+        """Whether the lists are there already."""
+        return self._lists is not None
+
     def __getstate__(self) -> tuple:
         return self.points, self.kept
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals
 from bbr_layer.margins import Pose
 from bbr_layer.neighbours import MutualNeighbours
-from bbr_layer.normals import point_spacing
+from bbr_layer.spacing import point_spacing
 from benchmarks.data import data_folder
 from benchmarks.memory import forget_peak, peak
 

@@ -23,7 +23,7 @@ ORDER = {
         margins
         cloud_trees
         neighbours neighbourhoods distances
-        normals buddies temperature
+        normals buddies temperature spacing searches
         kernels.scene kernels.squares
         kernels.blocks kernels.forward_mode kernels.soft_squares
         kernels.reference kernels.matched kernels.gpu_pairs

@@ -12,7 +12,7 @@ from torch import Tensor
 from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals, margins
 from bbr_layer.neighbourhoods import nearest_neighbours
 from bbr_layer.neighbours import MutualNeighbours, nearest_by_tiles
-from bbr_layer.normals import SPACING_POINTS, point_spacing
+from bbr_layer.spacing import SPACING_POINTS, point_spacing
 
 
 def first_nearest(queries: Tensor, points: Tensor) -> Tensor:
