@@ -1,19 +1,19 @@
 """Best Buddies Registration (Drory, Shomer, Avidan, Giryes, ACCV 2020) as a differentiable layer."""
 
 from contextlib import nullcontext
-from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from bbr_layer.backward import Backward, Detached, Implicit, Replay, speak_up
+from bbr_layer.descent import descended
 from bbr_layer.door import batch_shape, checked_pair, checked_start
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.named_stages import default_stages, named_stage, paper_stage
-from bbr_layer.pair import CloudPair, Frame
+from bbr_layer.named_stages import default_stages, fast_stages, named_stage, paper_stage
+from bbr_layer.pair import CloudPair
 from bbr_layer.preparation import begun_at, prepared
 from bbr_layer.registration import Registration, judge, matched_information
-from bbr_layer.stage import Inner, Stage, StageResult
+from bbr_layer.stage import Inner, Stage
 from bbr_layer.starts import best_start
 from bbr_layer.temperature import Temperature
 from bbr_layer.transforms import is_transformed, registered
@@ -64,6 +64,8 @@ class BBRLayer(nn.Module):
         if not named and len(given) != len(stages):
             raise ValueError("stages must all be Stage objects, or one of the paper's names alone: try BBRLayer('F')")
         chosen = [named_stage(names[0], inner, temperature)] if named else given or default_stages()
+        if chosen[0].above:
+            raise ValueError(f"the first stage has above={chosen[0].above}; smaller clouds would be left with none: 0")
         self.stages = nn.ModuleList(chosen)
         if not isinstance(starts, int) or starts < 1:
             raise ValueError(f"starts is {starts}; it must be a whole number of at least 1: try 7")
@@ -75,6 +77,14 @@ class BBRLayer(nn.Module):
     def sequence(self) -> list[Stage]:
         """The stages in order."""
         return [stage for stage in self.stages if isinstance(stage, Stage)]
+
+    @staticmethod
+    def fast(backward: Backward | None = None) -> "BBRLayer":
+        """Soft buddies of few points, then a few steps of Gauss-Newton: about half the time of the default.
+
+        As accurate, but more of the turns above 30 degrees fail.
+        """
+        return BBRLayer(*fast_stages(), backward=backward)
 
     @staticmethod
     def robust(backward: Backward | None = None) -> "BBRLayer":
@@ -150,20 +160,20 @@ class BBRLayer(nn.Module):
         needs_normals = any(stage.loss.needs_normals for stage in self.sequence)
         frame, pair = prepared(given, needs_normals, self.scaled)
         motion = begun_at(start, pair, frame, self.scaled)
-        stages = self.sequence
+        stages = [stage for stage in self.sequence if stage.wanted(pair)]
         if self.starts > 1:
             motion, stages[0] = best_start(self.starts, stages[0], (pair, frame), motion)
         mode = self.backward_mode if differentiable else Detached()
-        ended = _descended(stages, (pair, frame), motion, mode)
+        ended = descended(stages, (pair, frame), motion, mode)
         if isinstance(mode, Implicit):
-            ended, doubt = self.sequence[-1].attach(pair, frame, ended, mode.damping)
+            ended, doubt = stages[-1].attach(pair, frame, ended, mode.damping)
             if doubt and mode.on_unconverged == "replay":
-                ended = _descended(stages, (pair, frame), motion, Replay())
+                ended = descended(stages, (pair, frame), motion, Replay())
             elif doubt:
                 speak_up(mode, doubt)
         buddies, information = matched_information(pair, frame.enter(ended.motion), frame)
         status = judge(ended.motion, buddies, information, frame, ended.settled)
-        iterations = torch.full_like(buddies, sum(stage.inner.steps for stage in self.sequence))
+        iterations = torch.full_like(buddies, sum(stage.inner.steps for stage in stages))
         found = ended.loss, ended.temperature, ended.gradient_norm
         return Registration(ended.motion, *found, iterations, buddies, information, status)
 
@@ -176,22 +186,6 @@ class BBRLayer(nn.Module):
         stages = ", ".join(map(repr, self.stages))
         starts = "" if self.starts == 1 else f", starts={self.starts}"
         return f"BBRLayer({stages}, backward={self.backward_mode!r}{starts})"
-
-
-def _descended(
-    stages: list[Stage], clouds: tuple[CloudPair, Frame], motion: RigidMotion, mode: Backward
-) -> StageResult:
-    """All stages, each from where the last one ended."""
-    steps, done = sum(stage.inner.steps for stage in stages), 0
-    for stage in stages:
-        ended = stage(*clouds, motion, partial(_attached, mode, done, steps), closed_form=mode.closed_form)
-        motion, done = ended.motion, done + stage.inner.steps
-    return ended
-
-
-def _attached(mode: Backward, done: int, steps: int, step: int) -> bool:
-    """Whether ``step`` of a stage that begins after ``done`` of all ``steps`` is kept differentiable."""
-    return mode.attached(done + step, steps)
 
 
 def _device_type(points: Tensor) -> str:

@@ -100,6 +100,10 @@ class Stage(nn.Module):
         settled = _settled(self.chart.motion(earlier, frame), motion, pair)
         return StageResult(reached.frame.leave(motion), loss, final * frame.scale, end.gradient_norm, settled)
 
+    def wanted(self, pair: CloudPair) -> bool:
+        """Whether either cloud is as large as the stage is for."""
+        return max(pair.P.shape[1], pair.Q.shape[1]) > self.above
+
     def attach(self, pair: CloudPair, frame: Frame, ended: StageResult, damping: float) -> tuple[StageResult, str]:
         """The result with the derivative of an optimum, and in words why it may not be one; "" if it is."""
         pair = thinned_pair(pair, self.points)

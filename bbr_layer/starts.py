@@ -13,6 +13,7 @@ from bbr_layer.pair import CloudPair, Frame
 from bbr_layer.rotations import rotation_dimensions
 from bbr_layer.stage import SOFT_SMOOTHING, Stage
 from bbr_layer.temperature import Annealed
+from bbr_layer.thinning import thinned_pair
 
 # Radians between starts. Measured: with 40 degrees to each side of every axis none of 180 registrations of the bunny,
 # horse and dragon turned by 30, 60 or 90 degrees fails; benchmarks/starts.md.
@@ -65,7 +66,7 @@ def best_start(count: int, stage: Stage, clouds: tuple[CloudPair, Frame], begun:
     ------
     ValueError: more starts than there are.
     """
-    pair, frame = clouds
+    pair, frame = thinned_pair(clouds[0], stage.points), clouds[1]
     batch, d = begun.translation.shape
     if count > most_starts(d):
         raise ValueError(f"starts is {count}; in {d}D there are {most_starts(d)} of them at most: try 7")
@@ -91,7 +92,7 @@ def _heated(stage: Stage, hot: Tensor) -> Stage:
         return stage
     own = torch.as_tensor(stage.temperature.start, dtype=torch.float64, device=hot.device)
     heats = torch.where(hot, own.clamp(min=HOT), own)
-    return Stage(stage.loss, stage.inner, Annealed(heats, stage.temperature.end), stage.chart)
+    return Stage(stage.loss, stage.inner, Annealed(heats, stage.temperature.end), stage.chart, points=stage.points)
 
 
 def _buddies_missing(pair: CloudPair, motion: RigidMotion) -> Tensor:

@@ -8,12 +8,11 @@ from torch import Tensor
 from bbr_layer.pair import CloudPair
 from bbr_layer.spacing import with_spacing
 
-# Grids tried: a surface has as many occupied cells as the square of their inverse size, so that each guess is near.
-GUESSES = 6
-# Aimed for, as a share of the points allowed: a guess that is a little off then still keeps no more than that.
-AIM = 0.95
-# Share of the points allowed that no further grid is tried for.
-GOOD_ENOUGH = 0.85
+# Grids tried at most. A surface has as many occupied cells as the square of their inverse size, so that guesses are
+# near; where nearly every point has a cell to itself, cells at least grow by a part.
+GUESSES, LEAST_GROWTH = 12, 1.15
+# Share of the points allowed that is aimed for, and from which on no further grid is tried.
+AIM, GOOD_ENOUGH = 0.95, 0.85
 # Cells of a grid that int64 can number.
 LARGEST_NUMBER = 2.0**62
 
@@ -30,13 +29,20 @@ def evenly_thinned(points: Float[np.ndarray, "n d"], most: int) -> Int[np.ndarra
         return np.arange(len(points))
     kept = np.zeros(1, dtype=np.int64)  # all in one cell, should every grid that is tried leave too many
     cell = float(np.ptp(points, axis=0).max()) / most**0.5
+    largest_crowded = 0.0
     for _ in range(GUESSES if cell > 0 else 0):
         first = _first_of_cells(points, cell)
         if len(kept) < len(first) <= most:
             kept = first
         if GOOD_ENOUGH * most <= len(first) <= most:
             break
-        cell *= (len(first) / (AIM * most)) ** 0.5
+        guess = cell * (len(first) / (AIM * most)) ** 0.5
+        if len(first) > most:
+            largest_crowded = max(largest_crowded, cell)
+            guess = max(guess, LEAST_GROWTH * cell)
+        elif guess <= largest_crowded:
+            guess = (cell * largest_crowded) ** 0.5
+        cell = guess
     return np.sort(kept)
 
 

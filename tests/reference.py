@@ -85,6 +85,22 @@ def buddy_filter(D, D_normal, weights=None):
     return top / sum(B[i, j] * _weight(weights, i, j) for i, j in pairs)
 
 
+def normal_equations(residuals, counts):
+    """sum of c J J^T and of c r J over residuals r_k, given as a function of six (in the plane three) pose numbers.
+
+    A pair's residual is a number or a vector; J is its derivative at no motion.
+    """
+    k = residuals.tangent
+    still = torch.zeros(k, dtype=torch.float64)
+    matrix, slope = torch.zeros(k, k, dtype=torch.float64), torch.zeros(k, dtype=torch.float64)
+    for index, count in counts.items():
+        J = torch.func.jacrev(lambda x, index=index: residuals(x, *index))(still).reshape(-1, k)
+        r = residuals(still, *index).reshape(-1)
+        for row, value in zip(J, r, strict=True):
+            matrix, slope = matrix + count * torch.outer(row, row), slope + count * value * row
+    return matrix, slope
+
+
 def euler_rotation(a, b, c):
     """Rz(c) Ry(b) Rx(a), entry by entry."""
     x = torch.tensor([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]])

@@ -48,7 +48,7 @@ ORDER = {
         backward transforms preparation
         thinning
         stage
-        named_stages starts
+        named_stages starts descent
         layer
         atomic cloud_columns
         cloud_tables cloud_formats cloud_writing trajectories

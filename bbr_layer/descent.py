@@ -1,0 +1,29 @@
+"""All stages of a registration, each from where the last one ended."""
+
+from functools import partial
+
+from bbr_layer.backward import Backward
+from bbr_layer.geometry import RigidMotion
+from bbr_layer.pair import CloudPair, Frame
+from bbr_layer.stage import Stage, StageResult
+
+
+def descended(stages: list[Stage], clouds: tuple[CloudPair, Frame], motion: RigidMotion, mode: Backward) -> StageResult:
+    """Where the last of ``stages`` ended, at least one.
+
+    Parameters
+    ----------
+    clouds: the centred pair and its frame.
+    motion: where to begin, between the user's frames.
+    mode: which steps keep a graph, counted over all stages.
+    """
+    steps, done = sum(stage.inner.steps for stage in stages), 0
+    for stage in stages:
+        ended = stage(*clouds, motion, partial(_attached, mode, done, steps), closed_form=mode.closed_form)
+        motion, done = ended.motion, done + stage.inner.steps
+    return ended
+
+
+def _attached(mode: Backward, done: int, steps: int, step: int) -> bool:
+    """Whether ``step`` of a stage that begins after ``done`` of all ``steps`` is kept differentiable."""
+    return mode.attached(done + step, steps)

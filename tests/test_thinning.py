@@ -1,0 +1,69 @@
+"""Fewer points for a stage: even in space, as many as asked for, and differentiable in those that are kept."""
+
+import numpy as np
+import pytest
+import torch
+from problems import bumpy, motion
+
+from bbr_layer import Adam, BBRLayer, BuddyFilter, CloudPair, Detached, GaussNewton, SoftBBS, Stage, angular_error
+from bbr_layer.thinning import evenly_thinned, thinned_pair
+
+
+@pytest.mark.parametrize("most", [1, 7, 100, 900])
+def test_no_more_than_asked_for_and_not_many_fewer(rng, most):
+    points = rng.random((1000, 3))
+    kept = evenly_thinned(points, most)
+    assert most / 2 <= len(kept) <= most
+    assert (np.diff(kept) > 0).all()
+
+
+def test_dense_places_are_thinned_most(rng):
+    points = np.concatenate((rng.random((2000, 2)), 0.01 * rng.random((2000, 2)) + 5))
+    kept = evenly_thinned(points, 300)
+    assert (kept >= 2000).sum() < 30 < (kept < 2000).sum()
+
+
+def test_few_points_are_all_kept_and_equal_ones_are_one(rng):
+    assert evenly_thinned(rng.random((5, 3)), 5).tolist() == [0, 1, 2, 3, 4]
+    assert evenly_thinned(np.ones((50, 3)), 10).tolist() == [0]
+
+
+def test_a_pair_keeps_its_companions_and_leaves_padding_out():
+    P, Q = torch.rand(2, 300, 3), torch.rand(2, 40, 3)
+    mask = torch.arange(300)[None] < torch.tensor([[300], [90]])
+    pair = CloudPair(P, Q, P_normals=P + 1, P_weights=P[..., 0], P_mask=mask, spacing=torch.ones(2))
+    thin = thinned_pair(pair, 100)
+    assert thin.Q is Q and thin.P.shape[1] <= 100 and thin.P_mask is not None
+    assert thin.P_mask[1].sum() == 90
+    torch.testing.assert_close(thin.P_normals, thin.P + 1)
+    torch.testing.assert_close(thin.P_weights, thin.P[..., 0])
+    assert set(map(tuple, thin.P[1][thin.P_mask[1]].tolist())) == set(map(tuple, P[1, :90].tolist()))
+    assert (thin.spacing < pair.spacing).all()
+    assert thinned_pair(pair, None) is pair and thinned_pair(pair, 300) is pair
+
+
+def test_gradients_reach_the_kept_points_alone():
+    P = bumpy(200, 3).requires_grad_()
+    Q = motion(3, 0.1).inverse()(P.detach())
+    layer = BBRLayer(Stage(SoftBBS(smoothing=0.2), Adam(5), points=50))
+    (gradient,) = torch.autograd.grad(layer(P, Q).target_from_source.matrix.square().sum(), P)
+    moved = gradient.abs().amax(1) > 1e-9 * gradient.abs().max()
+    assert 20 < moved.sum() <= 200  # the centre hangs on all points
+    assert torch.isfinite(gradient).all()
+
+
+def test_a_large_pair_goes_through_all_stages_and_a_small_one_leaves_the_last_out():
+    stages = [Stage(BuddyFilter(), GaussNewton(4), points=100), Stage(BuddyFilter(), GaussNewton(2), above=150)]
+    layer, truth = BBRLayer(*stages, backward=Detached()), motion(3, 0.05, 0.01)
+    for count, iterations in ((140, 4), (400, 6)):
+        P = bumpy(count, 3)
+        result = layer(P, truth.inverse()(P))
+        assert result.iterations.item() == iterations
+        assert angular_error(result.target_from_source.rotation, truth.rotation) < 0.02
+
+
+def test_hardly_any_points_or_no_first_stage_are_refused():
+    with pytest.raises(ValueError, match="points is 3; a stage needs at least 4"):
+        Stage(BuddyFilter(), points=3)
+    with pytest.raises(ValueError, match="the first stage has above=10"):
+        BBRLayer(Stage(BuddyFilter(), above=10))
