@@ -25,7 +25,7 @@ check: $(INSTALLED)  ## formatting, lint, types and tests
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy bbr_layer models train
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 format: $(INSTALLED)  ## let ruff format and sort what it can
 	$(BIN)/ruff check --fix .
