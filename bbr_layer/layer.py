@@ -80,9 +80,9 @@ class BBRLayer(nn.Module):
 
     @staticmethod
     def fast(backward: Backward | None = None) -> "BBRLayer":
-        """Soft buddies of few points, then a few steps of Gauss-Newton: about half the time of the default.
+        """Soft buddies of few points, then a few steps of Gauss-Newton: six tenths of the default's time.
 
-        As accurate, but more of the turns above 30 degrees fail.
+        As accurate, but more of the turns by 60 degrees fail (benchmarks/solvers.md).
         """
         return BBRLayer(*fast_stages(), backward=backward)
 

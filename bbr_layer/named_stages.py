@@ -11,10 +11,10 @@ from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD, SoftBDNormals
 from bbr_layer.stage import SOFT_SMOOTHING, Inner, Stage
 from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
 
-# Points of each cloud that soft buddies are sought among, whose cost grows with the square: as many as a street's
-# registration needs to end where F goes on; and, for the fast ones, what the bunny's, horse's and dragon's need.
+# Points of each cloud that soft buddies are sought among, whose cost grows with the square: on streets 1000 lead to
+# where F goes on (benchmarks/lidar.md). The fast ones trade basin for time: benchmarks/solvers.md.
 SOFT_POINTS, FAST_SOFT_POINTS = 1000, 300
-# Points of each cloud that most of F's steps see; the last few see all. On a street 10 000 end 0.01 degrees from there.
+# Points of each cloud that most of F's steps see; the last few see all. Chosen: a twelfth of a full lidar scan.
 FINE_POINTS = 10_000
 
 

@@ -71,3 +71,24 @@ def test_an_exact_copy_of_a_real_surface(real_data, name):
 def test_a_registration_cut_short_is_another_matter():
     shares = shares_of_sensitivity(BBRLayer("F", inner=Adam(20)), bumpy(250, 3))
     assert not ((shares > 1 / FACTOR) & (shares < FACTOR)).all()
+
+
+@pytest.mark.parametrize("layer", [BBRLayer(), BBRLayer.fast()], ids=["default", "fast"])
+@pytest.mark.parametrize("kind", ["another sample", "an exact copy"])
+def test_the_gradient_through_all_stages_is_that_of_central_differences(layer, kind):
+    P = bumpy(100, 3)
+    Q = exact_copy(P if kind == "an exact copy" else bumpy(100, 3))
+    mix = torch.randn(6, dtype=torch.float64)
+
+    def pose(P: Tensor, Q: Tensor) -> Tensor:
+        found = layer(P, Q).target_from_source
+        return (torch.cat((found.rotvec, found.translation)) * mix).sum()
+
+    leaves = P.clone().requires_grad_(), Q.clone().requires_grad_()
+    gradients = torch.autograd.grad(pose(*leaves), leaves)
+    step = 1e-9  # wider ones measure buddies that change hands
+    for _ in range(4):
+        along = [torch.randn_like(x) for x in (P, Q)]
+        ahead, behind = (pose(P + s * step * along[0], Q + s * step * along[1]).item() for s in (1, -1))
+        own = sum((g * a).sum().item() for g, a in zip(gradients, along, strict=True))
+        assert own == pytest.approx((ahead - behind) / (2 * step), rel=1e-2, abs=1e-3 * gradients[1].norm().item())
