@@ -9,6 +9,10 @@ from bbr_layer.trees import ROUNDING, Tree, in_space, squared_length
 
 COMPILED = importlib.util.find_spec("numba") is not None
 
+# Points of clouds in which what the walk leaves open is compared with every point, rather than looked up in a tree from
+# Python. Chosen: a comparison with 4096 points takes about as long as a look-up and its call.
+SMALL = 4096
+
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 
@@ -39,6 +43,7 @@ class Margins:
         self.places = np.zeros((len(moving), 3))  # y
         self.everybody = np.ones(len(moving), dtype=bool)
         self.asked = self.searched = self.looked_up = 0
+        self._tables: tuple | None = None
 
     def nearest(self, pose: Pose, wanted: Bool[np.ndarray, "m"] | None = None) -> Int[np.ndarray, "m"]:
         """Index of the nearest point of the tree to each moved point, right for the ``wanted`` ones (None: all)."""
@@ -52,6 +57,15 @@ class Margins:
             self.index[rows], _, self.reach[rows] = self.tree.nearest(at[:, : self.tree.points.shape[1]])
             self.places[rows] = at
         return self.index
+
+    def tables(self) -> tuple:
+        """Everything that compiled code reads and writes: lists, moving points, all of them wanted, memory."""
+        if self._tables is None:
+            from bbr_layer.kernels import cpu_walk
+
+            lists, memory = self.tree.lists(), cpu_walk.Memory(self.index, self.reach, self.places)
+            self._tables = cpu_walk.Lists(*lists), self.moving, self.everybody, memory
+        return self._tables
 
     def _changed(self, pose: Pose, wanted: np.ndarray) -> tuple[int, Int[np.ndarray, "k"]]:
         """How many of the wanted neighbours may have changed, and the rows of those still to be looked up."""
@@ -83,12 +97,15 @@ class MutualMargins:
     def __init__(self, P: Tree, Q: Tree, kept: bool):
         self.forth = Margins(P, in_space(Q.points), kept)
         self.back = Margins(Q, in_space(P.points), kept)
+        self.small = max(len(P.points), len(Q.points)) <= SMALL
 
     def __call__(self, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
         """For each point of Q the nearest of P with Q carried by ``pose``, and whether the choice is mutual.
 
         The first is valid until the next call. P, carried back, is looked up in Q, and of it only the chosen points.
         """
+        if COMPILED and self.small and self.forth.kept:
+            return self._compiled(pose)
         index = self.forth.nearest(pose)
         back = pose[0].T.copy(), -pose[0].T @ pose[1]
         if COMPILED:
@@ -99,6 +116,16 @@ class MutualMargins:
         chosen = np.zeros(len(self.back.moving), dtype=bool)
         chosen[index] = True
         return index, self.back.nearest(back, chosen)[index] == np.arange(len(index))
+
+    def _compiled(self, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
+        from bbr_layer.kernels import cpu_walk
+
+        mutual, counts = cpu_walk.mutual_pairs(self.forth.tables(), self.back.tables(), pose)
+        for side, (asked, searched, looked_up) in zip((self.forth, self.back), counts, strict=True):
+            side.asked += asked
+            side.searched += searched
+            side.looked_up += looked_up
+        return self.forth.index, mutual
 
 
 def _moved(pose: Pose, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:

@@ -1,11 +1,15 @@
 """The normals of a cloud, differentiable in its coordinates."""
 
+import importlib.util
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bbr_layer.neighbourhoods import nearest_neighbours
 
+COMPILED = importlib.util.find_spec("numba") is not None
 # Neighbours (the point itself included) of the plane fit when normals are not given. Measured: 8 of the sparse
 # cloud's own points beat 13 (the paper's number, meant for the full cloud) on the bunny at 500 to 1000 points.
 NORMAL_NEIGHBOURS = 8
@@ -45,28 +49,47 @@ def estimate_normals(
     flat = points if len(batch) == 1 else points.reshape(-1, n, d)
     real = None if mask is None else mask.reshape(-1, n)
     index = nearest_neighbours(flat, neighbours, real)
-    around = torch.take_along_dim(flat[:, None], index[..., None], dim=2).double()
-    offsets = around - around.mean(2, keepdim=True)
-    normals = _thinnest_direction(offsets.mT @ offsets / neighbours)
+    variances, axes = _axes(flat, index)
+    normals = axes[..., 0]
+    if torch.is_grad_enabled() and flat.requires_grad:
+        normals = normals + _first_order(_covariance(flat, index), variances, axes)
     outward = _outward(normals, flat.double(), real)
     return (normals * outward).to(points.dtype).reshape(*batch, n, d)
 
 
-def _thinnest_direction(covariance: Tensor) -> Tensor:
-    """Eigenvector of the smallest eigenvalue, with its first-order dependence on the covariance.
+def _covariance(points: Tensor, index: Tensor) -> Tensor:
+    """Of the points in every row of ``index (batch, n, k)``, ``(batch, n, d, d)`` float64."""
+    around = torch.take_along_dim(points[:, None], index[..., None], dim=2).double()
+    offsets = around - around.mean(2, keepdim=True)
+    return offsets.mT @ offsets / index.shape[-1]
 
-    ``n + sum_k v_k <v_k, C n> / (l_0 - l_k)``: the sum is 0 in value, and its derivative is that of the eigenvector.
-    ``torch.linalg.eigh`` would also divide by the gap between the *other* two eigenvalues, which may vanish.
+
+@torch.no_grad()
+def _axes(points: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Variances ``(batch, n, d)``, least first, and axes ``(batch, n, d, d)``, by column; compiled where it can be."""
+    if points.shape[-1] != 3 or points.device.type != "cpu" or not COMPILED or not len(points):
+        return torch.linalg.eigh(_covariance(points, index))
+    from bbr_layer.kernels import cpu_axes  # only where it is used: Numba takes long to load
+
+    clouds = zip(points.detach().double().numpy(), index.numpy(), strict=True)
+    found = [cpu_axes.axes(cloud, rows) for cloud, rows in clouds]
+    variances, axes = (torch.from_numpy(np.stack(x)) for x in zip(*found, strict=True))
+    return variances, axes
+
+
+def _first_order(covariance: Tensor, variances: Tensor, axes: Tensor) -> Tensor:
+    """What depends on the covariance in its first axis, to first order: 0 in value.
+
+    ``sum_k v_k <v_k, C n> / (l_0 - l_k)``. The derivative of ``torch.linalg.eigh`` would also divide by the gap between
+    the *other* two eigenvalues, which may vanish.
     """
-    values, vectors = torch.linalg.eigh(covariance.detach())
-    normal = vectors[..., 0]
-    gaps = values[..., :1] - values[..., 1:]
-    determined = -gaps > EIGENVALUE_GAP * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)
+    normal, others = axes[..., 0], axes[..., 1:]
+    gaps = variances[..., :1] - variances[..., 1:]
+    determined = -gaps > EIGENVALUE_GAP * variances[..., -1:].clamp(min=torch.finfo(variances.dtype).tiny)
     inverse_gaps = torch.where(determined, 1 / torch.where(determined, gaps, 1.0), 0.0)
-    others = vectors[..., 1:]
     coupling = (others * (covariance @ normal[..., None])).sum(-2)
     correction = (others * (coupling * inverse_gaps)[..., None, :]).sum(-1)
-    return normal + correction - correction.detach()
+    return correction - correction.detach()
 
 
 def _outward(normals: Tensor, points: Tensor, mask: Tensor | None) -> Tensor:

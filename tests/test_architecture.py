@@ -18,7 +18,7 @@ ORDER = {
         pair trees
         kernels
         kernels.cpu_math kernels.cpu_threads
-        kernels.cpu_walk kernels.cpu_turns
+        kernels.cpu_walk kernels.cpu_turns kernels.cpu_axes
         kernels.cpu_adam
         margins
         cloud_trees

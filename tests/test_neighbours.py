@@ -63,10 +63,12 @@ def converging(d: int, batch: int, steps: int = 30) -> list[RigidMotion]:
     return found
 
 
-@pytest.fixture(params=["compiled", "plain"], autouse=True)
+@pytest.fixture(params=["compiled", "compiled as for large clouds", "plain"], autouse=True)
 def arithmetic(request, monkeypatch) -> None:
-    """Every test with the compiled walk from neighbour to neighbour, and without."""
-    monkeypatch.setattr("bbr_layer.margins.COMPILED", request.param == "compiled")
+    """Every test with the compiled walk from neighbour to neighbour, whole or with a tree behind it, and without."""
+    monkeypatch.setattr("bbr_layer.margins.COMPILED", request.param != "plain")
+    if request.param != "compiled":
+        monkeypatch.setattr("bbr_layer.margins.SMALL", 0)
 
 
 @pytest.fixture

@@ -134,3 +134,57 @@ def agreeing(index, back):  # type: ignore[no-untyped-def]
     for i in range(len(index)):
         mutual[i] = back[index[i]] == i
     return mutual
+
+
+@exact
+def _look_up(points, place):  # type: ignore[no-untyped-def]
+    """The first of the nearest points, its squared distance, and that of the nearest one that lies elsewhere."""
+    x, y, z = place
+    here, best = 0, np.inf
+    for row in range(len(points)):
+        squared = _squared(points, row, x, y, z)
+        if squared < best:
+            here, best = row, squared
+    second = np.inf
+    for row in range(len(points)):
+        squared = _squared(points, row, x, y, z)
+        if squared < second and _squared(points, row, points[here, 0], points[here, 1], points[here, 2]) > 0:
+            second = squared
+    return here, best, second
+
+
+@exact
+def refresh_all(lists, moving, pose, wanted, memory):  # type: ignore[no-untyped-def]
+    """``refresh``, and what the walk cannot decide is compared with every point: for clouds of a few thousand.
+
+    Returns
+    -------
+    How many were searched for, and how many of those in the whole cloud.
+    """
+    searched, rows = refresh(lists, moving, pose, wanted, memory)
+    rotation, translation = pose
+    for i in rows:
+        x, y, z = _moved(rotation, translation, moving, i)
+        memory.found[i], _, second = _look_up(lists.points, (x, y, z))
+        memory.reach[i] = np.sqrt(second)
+        memory.places[i, 0], memory.places[i, 1], memory.places[i, 2] = x, y, z
+    return searched, len(rows)
+
+
+@exact
+def mutual_pairs(forth, back, pose):  # type: ignore[no-untyped-def]
+    """Which choices of the moved points are mutual, and of each side how many were asked, searched for and looked up.
+
+    Parameters
+    ----------
+    forth, back: (lists, moving, wanted, memory) of the source in the target, of the target in the source.
+    """
+    rotation, translation = pose
+    turned = np.ascontiguousarray(rotation.T)
+    reverse = turned, -(turned @ translation)
+    first = refresh_all(forth[0], forth[1], pose, forth[2], forth[3])
+    index = forth[3].found
+    wanted = marked(index, len(back[1]))
+    second = refresh_all(back[0], back[1], reverse, wanted, back[3])
+    counts = (len(index), first[0], first[1]), (np.sum(wanted), second[0], second[1])
+    return agreeing(index, back[3].found), counts

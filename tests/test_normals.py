@@ -1,0 +1,48 @@
+"""Normals and the axes they come from: compiled against torch, and where the thinnest direction is not unique."""
+
+import numpy as np
+import pytest
+import torch
+
+from bbr_layer import estimate_normals, normals
+from bbr_layer.neighbourhoods import nearest_neighbours
+
+CLOUDS = {
+    "scattered": lambda: torch.randn(200, 3, dtype=torch.float64),
+    "far and small": lambda: 1e4 + 1e-3 * torch.randn(200, 3, dtype=torch.float64),
+    "a plane": lambda: torch.rand(200, 3, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.0]),
+    "a line": lambda: torch.rand(200, 1, dtype=torch.float64) * torch.tensor([1.0, 2.0, 3.0]),
+    "one place": lambda: torch.ones(20, 3, dtype=torch.float64),
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_compiled_axes_are_those_of_torch(name):
+    points = CLOUDS[name]()[None]
+    index = nearest_neighbours(points, 8)
+    variances, axes = normals._axes(points, index)
+    covariance = normals._covariance(points, index)
+    scale = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).max()
+    torch.testing.assert_close(
+        variances, torch.linalg.eigvalsh(covariance), atol=1e-14 * float(scale) + 1e-30, rtol=1e-9
+    )
+    rebuilt = axes @ torch.diag_embed(variances) @ axes.mT
+    torch.testing.assert_close(rebuilt, covariance, atol=1e-13 * float(scale) + 1e-30, rtol=1e-9)
+    torch.testing.assert_close(axes.mT @ axes, torch.eye(3, dtype=torch.float64).expand_as(axes), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_gradient_is_that_of_differences_and_asking_for_it_changes_nothing(d):
+    points = torch.randn(12, d, dtype=torch.float64)
+    plain = estimate_normals(points, 5)
+    assert torch.equal(estimate_normals(points.clone().requires_grad_(), 5), plain)
+    assert torch.autograd.gradcheck(lambda x: estimate_normals(x, 5), (points.requires_grad_(),), eps=1e-7, atol=1e-5)
+
+
+def test_an_arbitrary_normal_has_no_gradient():
+    line = (torch.linspace(0, 1, 20, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0, 3.0])).requires_grad_()
+    found = estimate_normals(line)
+    torch.testing.assert_close(found.norm(dim=1), torch.ones(20, dtype=torch.float64))
+    assert np.abs((found @ torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)).detach().numpy()).max() < 1e-6
+    (gradient,) = torch.autograd.grad((found * torch.randn_like(found)).sum(), line)
+    assert torch.isfinite(gradient).all()
