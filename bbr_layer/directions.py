@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-# A direction that both surfaces together hold with less than this share of the mean is free. Chosen: those that are free
-# on the shapes of tests/test_trust.py have less, and a corridor eight times as long as wide turns about itself with 0.02.
+# A direction that both surfaces together hold with less than this share of the mean is free. Chosen: those that are
+# free on the shapes of tests/test_trust.py have less; a corridor eight times as long as wide turns about itself with
+# 0.02.
 FREE_SHARE = 0.02
 # An eigenvalue below this share of the largest is 0 but for rounding.
 ROUNDING_SHARE = 1e-12
