@@ -45,7 +45,8 @@ def test_deviation_is_that_of_a_mean():
 def test_slides_and_turns_of_one_strength_are_told_apart():
     """A cylinder's slide and turn, which an eigenvector may mix in any way."""
     mixed = torch.tensor([[0, 0, 1, 0, 0, 1], [0, 0, -1, 0, 0, 1]], dtype=torch.float64) / 2**0.5
-    information = torch.eye(6, dtype=torch.float64) - mixed.mT @ mixed
+    strengths = torch.tensor([1.0, 0.999], dtype=torch.float64)[:, None]  # the eigenvectors are the mixtures
+    information = torch.eye(6, dtype=torch.float64) - mixed.mT @ (strengths * mixed)
     found = [direction for direction in named(information, 1.0, 1.0) if direction.free]
     assert [direction.words for direction in found] == [
         "turning about (0.00, 0.00, 1.00), held by nothing",
