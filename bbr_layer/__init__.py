@@ -14,6 +14,7 @@ from bbr_layer.clouds import read_cloud as read_cloud
 from bbr_layer.clouds import read_scans as read_scans
 from bbr_layer.clouds import sample_surface as sample_surface
 from bbr_layer.clouds import scan_paths as scan_paths
+from bbr_layer.directions import Direction as Direction
 from bbr_layer.functional import register as register
 from bbr_layer.geometry import RigidMotion as RigidMotion
 from bbr_layer.geometry import angular_error as angular_error

@@ -11,16 +11,14 @@ from rich.table import Table
 
 from bbr_layer.cloud_writing import write_cloud
 from bbr_layer.clouds import Cloud
+from bbr_layer.directions import Direction
 from bbr_layer.two_clouds import TwoClouds
-from bbr_layer.verdict import WeakestDirection
 
 
 def described(found: TwoClouds, target: Cloud, source: Cloud) -> dict[str, Any]:
     """The answer in plain numbers, lists and words; angles in degrees, lengths in the data's unit."""
     motion, verdict = found.registration.target_from_source, found.verdict
     matrix = in_space(found.target_from_source)
-    weakest = verdict.weakest
-    deviation = math.degrees(weakest.deviation) if weakest.turning else weakest.deviation
     return {
         "target_from_source": matrix.tolist(),
         "rotation_angle_deg": math.degrees(float(motion.rotvec.norm())),
@@ -31,17 +29,29 @@ def described(found: TwoClouds, target: Cloud, source: Cloud) -> dict[str, Any]:
         "buddies": verdict.buddies,
         "buddy_share": verdict.buddy_share,
         "residual_rms": verdict.residual_rms,
-        "close_share": verdict.close_share,
-        "weakest_direction": {
-            "motion": "rotation" if weakest.turning else "translation",
-            "axis": weakest.axis.tolist(),
-            "deviation": deviation if math.isfinite(deviation) else None,
-            "deviation_unit": "deg" if weakest.turning else "data",
-            "share_of_mean_information": weakest.share,
-        },
+        "confidence": verdict.confidence,
+        "weakest_direction": _plain(_of_one(found)[0]),
+        "free_directions": [_plain(direction) for direction in _of_one(found) if direction.free],
         "points_used": {"target": found.target_points, "source": found.source_points},
         "points_read": {"target": len(target.points), "source": len(source.points)},
         "points_dropped": {"target": target.dropped, "source": source.dropped},
+    }
+
+
+def _of_one(found: TwoClouds) -> list[Direction]:
+    """The directions of a registration without batch dimensions."""
+    return [direction for direction in found.registration.directions if isinstance(direction, Direction)]
+
+
+def _plain(direction: Direction) -> dict[str, Any]:
+    deviation = math.degrees(direction.deviation) if direction.turning else direction.deviation
+    return {
+        "motion": "rotation" if direction.turning else "translation",
+        "axis": direction.axis.tolist(),
+        "deviation": deviation if math.isfinite(deviation) else None,
+        "deviation_unit": "deg" if direction.turning else "data",
+        "share_of_mean_information": direction.share,
+        "words": direction.words,
     }
 
 
@@ -72,6 +82,8 @@ def show(console: Console, found: TwoClouds, answer: dict[str, Any], out: Path |
     for row in answer["target_from_source"]:
         console.print("  " + " ".join(f"{number:15.9f}" for number in row), highlight=False, soft_wrap=True)
     used, read = answer["points_used"], answer["points_read"]
+    directions = _of_one(found)
+    weak = [direction for direction in directions if direction.free] or directions[:1]
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, words in (
         ("rotation", f"{answer['rotation_angle_deg']:.4f} deg"),
@@ -79,7 +91,8 @@ def show(console: Console, found: TwoClouds, answer: dict[str, Any], out: Path |
         ("status", answer["status"]),
         ("best buddies", f"{answer['buddies']}, {answer['buddy_share']:.1%} of the points compared"),
         ("their RMS distance", f"{answer['residual_rms']:.4g}"),
-        ("weakest direction", weakest_in_words(found.verdict.weakest)),
+        ("confidence", f"{answer['confidence']:.2f}"),
+        *(("free direction" if direction.free else "weakest direction", direction.words) for direction in weak),
         ("points compared", f"{used['target']} of {read['target']} and {used['source']} of {read['source']}"),
     ):
         table.add_row(f"{name}  ", escape(words))
@@ -87,13 +100,3 @@ def show(console: Console, found: TwoClouds, answer: dict[str, Any], out: Path |
     console.print(escape(answer["sentence"]), style="green" if answer["trustworthy"] else "bold red", soft_wrap=True)
     if out is not None:
         console.print(f"The moved source is in {escape(str(out))}", soft_wrap=True)
-
-
-def weakest_in_words(weakest: WeakestDirection) -> str:
-    """Such as ``sliding along (0.01, 1.00, 0.02), uncertain by 0.003``."""
-    axis = ", ".join(f"{number:.2f}" for number in weakest.axis)
-    motion = f"turning about ({axis})" if weakest.turning else f"sliding along ({axis})"
-    if math.isinf(weakest.deviation):
-        return f"{motion}, held by nothing"
-    deviation = f"{math.degrees(weakest.deviation):.2g} deg" if weakest.turning else f"{weakest.deviation:.2g}"
-    return f"{motion}, uncertain by about {deviation}"

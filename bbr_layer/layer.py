@@ -12,7 +12,7 @@ from bbr_layer.geometry import RigidMotion
 from bbr_layer.named_stages import default_stages, fast_stages, named_stage, paper_stage
 from bbr_layer.pair import CloudPair
 from bbr_layer.preparation import begun_at, prepared
-from bbr_layer.registration import Registration, judge, matched_information
+from bbr_layer.registration import Registration, judged
 from bbr_layer.stage import Inner, Stage
 from bbr_layer.starts import best_start
 from bbr_layer.temperature import Temperature
@@ -171,11 +171,10 @@ class BBRLayer(nn.Module):
                 ended = descended(stages, (pair, frame), motion, Replay())
             elif doubt:
                 speak_up(mode, doubt)
-        buddies, information = matched_information(pair, frame.enter(ended.motion), frame)
-        status = judge(ended.motion, buddies, information, frame, ended.settled)
-        iterations = torch.full_like(buddies, sum(stage.inner.steps for stage in stages))
+        trust = judged(pair, frame, ended.motion, ended.settled)
+        iterations = torch.full_like(trust.buddies, sum(stage.inner.steps for stage in stages))
         found = ended.loss, ended.temperature, ended.gradient_norm
-        return Registration(ended.motion, *found, iterations, buddies, information, status)
+        return Registration(ended.motion, *found, iterations, *trust)
 
     def _wants_gradient(self, pair: CloudPair, start: RigidMotion | None) -> bool:
         settings = [x for m in self.modules() for x in vars(m).values() if isinstance(x, Tensor)]

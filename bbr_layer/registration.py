@@ -4,19 +4,15 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bbr_layer.distances import matched_plane_normals
+from bbr_layer.confidence import confidence, judged_clouds
+from bbr_layer.directions import Direction, named, spectrum
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.kernels.squares import point_rows
-from bbr_layer.pair import CloudPair, Frame
-from bbr_layer.rotations import rotation_dimensions
-from bbr_layer.searches import search_of
-
-# Degenerate: the weakest direction holds less than this share of the mean information. A plane sliding on a plane has
-# 0 up to noise; a room scanned from inside about 0.1.
-DEGENERATE_SHARE = 1e-3
+from bbr_layer.matches import matched, matched_information
+from bbr_layer.pair import CloudPair, Frame, centre_and_radius
+from bbr_layer.resistance import resistance
 
 
 class Status(IntEnum):
@@ -58,6 +54,13 @@ class Registration(NamedTuple):
         (point to plane where there are normals, else point to point) and a tangent of rotation (radians) before
         translation, about the centroid of the moved source, on the target's axes.
     status: ``(*batch,)`` codes of ``Status``.
+    resistance: ``(*batch, k, k)`` like ``information``, always point to plane, and only what both surfaces agree
+        on; counted on at most 2000 points of each. ``directions`` reads it.
+    residual: ``(*batch,)`` root mean square of the pairs' residuals, in the data's unit.
+    radius: ``(*batch,)`` root-mean-square radius of the source, in the data's unit; 1 where that is 0.
+    confidence: ``(*batch,)`` probability, 0 to 1, that the answer is right: rotation at most 5 degrees off, points at
+        most 5 percent of the radius on average (docs/trust.md). 0 where there are no buddies, where a direction is free
+        (``DEGENERATE``) and where the pose is not finite. Like all from ``iterations`` on it has no gradient.
     """
 
     target_from_source: RigidMotion
@@ -68,6 +71,10 @@ class Registration(NamedTuple):
     buddies: Int[Tensor, "*batch"]
     information: Float[Tensor, "*batch k k"]
     status: Int[Tensor, "*batch"]
+    resistance: Float[Tensor, "*batch k k"]
+    residual: Float[Tensor, "*batch"]
+    radius: Float[Tensor, "*batch"]
+    confidence: Float[Tensor, "*batch"]
 
     @property
     def words(self) -> str | list[str]:
@@ -75,45 +82,74 @@ class Registration(NamedTuple):
         words = [Status(code).words for code in self.status.reshape(-1).tolist()]
         return words[0] if self.status.ndim == 0 else words
 
+    @property
+    def directions(self) -> list[Direction] | list[list[Direction]]:
+        """How well each of the k directions of motion is held, weakest first; a list of such, for a batch."""
+        found = self._named()
+        return found[0] if self.resistance.ndim == 2 else found
+
+    @property
+    def weak_directions(self) -> list[Direction] | list[list[Direction]]:
+        """The directions that nothing holds, in words by ``Direction.words``: none unless the status is degenerate.
+
+        A plane has two slides and a turn, a sphere three turns, a cylinder a turn and a slide, a corridor a slide.
+        """
+        found = [[direction for direction in item if direction.free] for item in self._named()]
+        return found[0] if self.resistance.ndim == 2 else found
+
+    def _named(self) -> list[list[Direction]]:
+        held, radius, residual = (torch.as_tensor(x) for x in (self.resistance, self.radius, self.residual))
+        k = held.shape[-1]
+        items = zip(held.reshape(-1, k, k), radius.reshape(-1).tolist(), residual.reshape(-1).tolist(), strict=True)
+        return [named(*item) for item in items]
+
     def reshape(self, batch: tuple[int, ...]) -> "Registration":
         """The same answer under other batch dimensions."""
         motion = RigidMotion(*(x.reshape((*batch, *x.shape[1:])) for x in self.target_from_source))
         return Registration(motion, *(x.reshape((*batch, *x.shape[1:])) for x in self[1:]))
 
 
-@torch.no_grad()
-def matched_information(pair: CloudPair, motion: RigidMotion, frame: Frame) -> tuple[Tensor, Tensor]:
-    """How many mutual pairs there are, ``(batch,)``, and their Gauss-Newton Hessian ``(batch, k, k)`` in data units."""
-    index, mutual = search_of(pair)(motion)
-    arms = motion.rotate(pair.Q.to(motion.rotation.dtype)) * frame.scale[:, None, None]
-    weights = mutual.double()
-    if pair.P_weights is not None:
-        weights = weights * pair.P_weights.gather(1, index)
-    if pair.Q_weights is not None:
-        weights = weights * pair.Q_weights
-    if pair.P_normals is None or pair.Q_normals is None:
-        jacobian = point_rows(arms)
-    else:
-        P_normals = pair.P_normals.gather(1, index[..., None].expand_as(pair.Q)).double()
-        planes = matched_plane_normals(P_normals, motion.rotate(pair.Q_normals.double())) / 2
-        jacobian = (planes[:, :, None, :] @ point_rows(arms)).squeeze(2)[:, :, None, :]
-    weighted = jacobian * weights[..., None, None]
-    return mutual.sum(-1), torch.einsum("bnrk,bnrl->bkl", weighted, jacobian)
+class Trust(NamedTuple):
+    """The fields of ``Registration`` from ``buddies`` on."""
+
+    buddies: Int[Tensor, "batch"]
+    information: Float[Tensor, "batch k k"]
+    status: Int[Tensor, "batch"]
+    resistance: Float[Tensor, "batch k k"]
+    residual: Float[Tensor, "batch"]
+    radius: Float[Tensor, "batch"]
+    confidence: Float[Tensor, "batch"]
 
 
 @torch.no_grad()
-def judge(
-    motion: RigidMotion, buddies: Tensor, information: Tensor, frame: Frame, settled: Tensor
-) -> Int[Tensor, "batch"]:
-    """Status code of each item; the worst that applies."""
-    k = rotation_dimensions(motion.dimension)
-    unit = torch.ones_like(information[..., 0])
-    unit[:, :k] = 1 / frame.scale[:, None]  # a rotation counted by how far it moves the cloud's rim
-    comparable = torch.nan_to_num(information * unit[:, :, None] * unit[:, None, :])
-    eigenvalues = torch.linalg.eigvalsh(comparable)
-    weakest, mean = eigenvalues[:, 0], eigenvalues.mean(-1)
+def judged(pair: CloudPair, frame: Frame, motion: RigidMotion, settled: Bool[Tensor, "batch"]) -> Trust:
+    """What the pairs say about an answer.
+
+    Parameters
+    ----------
+    pair, frame: the centred clouds; ``motion`` between the user's frames.
+    settled: whether the last steps still moved it.
+    """
+    entered = frame.enter(motion)
+    found = matched(pair, entered)
+    information, residual = matched_information(pair, entered, frame, found)
+    seen = judged_clouds(pair)
+    pairs = found if _same(seen, pair) else matched(seen, entered)
+    buddies = found.mutual.sum(-1)
+    share = buddies / pairs.mutual.sum(-1).clamp(min=1)
+    held = resistance(seen, entered, pairs, frame.scale) * share[:, None, None]
+    radius = centre_and_radius(pair.Q, pair.Q_mask)[1] * frame.scale
+    radius = torch.where(radius > 0, radius, 1.0)
+    free = spectrum(held, radius)[2].any(-1)
     status = torch.where(settled, int(Status.CONVERGED), int(Status.ITERATION_LIMIT))
-    status = torch.where(weakest <= DEGENERATE_SHARE * mean, int(Status.DEGENERATE), status)
+    status = torch.where(free, int(Status.DEGENERATE), status)
     status = torch.where(buddies == 0, int(Status.NO_BUDDIES), status)
     finite = torch.isfinite(motion.translation).all(-1) & torch.isfinite(motion.rotation).all(-1).all(-1)
-    return torch.where(finite, status, int(Status.NON_FINITE))
+    status = torch.where(finite, status, int(Status.NON_FINITE))
+    believed = torch.where(status <= int(Status.ITERATION_LIMIT), confidence(seen, pairs), 0.0)
+    return Trust(buddies, information, status, held, residual, radius, believed)
+
+
+def _same(seen: CloudPair, pair: CloudPair) -> bool:
+    """Whether a pair was neither thinned nor given normals."""
+    return all(getattr(seen, name) is getattr(pair, name) for name in ("P", "Q", "P_normals", "Q_normals"))

@@ -83,7 +83,7 @@ def register_clouds(
     if not np.isfinite(result.target_from_source.matrix.numpy()).all():
         raise ValueError(str(result.words))
     moved = result.target_from_source(Q.points).numpy()
-    verdict = give_verdict(P.points.numpy(), moved, result.information.numpy(), str(result.words))
+    verdict = give_verdict(P.points.numpy(), moved, float(result.confidence), str(result.words))
     return TwoClouds(result, verdict, result.target_from_source.matrix.numpy(), len(P.points), len(Q.points))
 
 

@@ -37,7 +37,9 @@ ORDER = {
         kernels.soft
         loss_base
         losses
-        registration start door
+        matches directions start door
+        confidence resistance
+        registration
         inner
         inner.schedules inner.charts inner.once
         inner.adam inner.pose_gradient inner.gauss_newton

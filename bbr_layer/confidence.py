@@ -1,0 +1,93 @@
+"""The probability that an answer is right, from three shares of its pairs that no unit and no density changes.
+
+Right means: rotation at most 5 degrees off, and the source's points at most 5 percent of its root-mean-square radius
+from where they belong, on average. How well it is calibrated: docs/trust.md.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bbr_layer.matches import Matches
+from bbr_layer.neighbourhoods import nearest_neighbours
+from bbr_layer.normals import estimate_normals
+from bbr_layer.pair import CloudPair
+
+# Points of each cloud that are judged: with 10 000 the sensor's noise is wider than the spacing, and fewer pairs of
+# right answers are close; with 1000 to 4000 it is not so.
+JUDGED_POINTS = 2000
+# Of two points on one surface the plane of the pair is nearer than this share of the spacing; two points of a pair are
+# not farther apart than so many spacings. Chosen among 0.25, 0.5, 1 and 2.
+ON_PLANE = 0.5
+NEAR = 2.0
+# Logistic regression: of 1, share of the smaller cloud with a buddy, share of pairs on one plane, share of them near.
+# `python -m benchmarks.reliability` fits them.
+COEFFICIENTS = (-65.28, 8.95, 33.81, 35.42)
+
+
+@torch.no_grad()
+def judged_clouds(pair: CloudPair) -> CloudPair:
+    """At most 2000 points of each cloud, drawn by a fixed seed, and their normals."""
+    P, P_normals, P_mask = _judged(pair.P, pair.P_normals, pair.P_mask)
+    Q, Q_normals, Q_mask = _judged(pair.Q, pair.Q_normals, pair.Q_mask)
+    return CloudPair(P, Q, P_normals, Q_normals, P_mask=P_mask, Q_mask=Q_mask)
+
+
+@torch.no_grad()
+def confidence(pair: CloudPair, found: Matches) -> Float[Tensor, "batch"]:
+    """Probability that the answer is right, in [0, 1], float64; 0 where no two points are buddies.
+
+    Parameters
+    ----------
+    pair: as ``judged_clouds`` has it.
+    found: its pairs at the answer.
+    """
+    shares = statistics(pair, found)
+    weights = torch.tensor(COEFFICIENTS, dtype=torch.float64, device=shares.device)
+    probability = torch.sigmoid(weights[0] + shares @ weights[1:])
+    return torch.where(found.mutual.any(-1), torch.nan_to_num(probability, nan=0.0), 0.0)
+
+
+@torch.no_grad()
+def statistics(pair: CloudPair, found: Matches) -> Float[Tensor, "batch 3"]:
+    """Shares in [0, 1]: of the smaller cloud's points that have a buddy; of the pairs on one plane; of the near ones.
+
+    A pair's spacing is the mean of its two points' distances to the next points of their own clouds.
+    """
+    spacing = (_gaps(pair.Q, pair.Q_mask) + _gaps(pair.P, pair.P_mask).gather(1, found.nearest)) / 2
+    normals, _ = found.normal_parts()
+    on_plane = (found.offsets * normals).sum(-1).abs() <= ON_PLANE * spacing
+    near = torch.linalg.vector_norm(found.offsets, dim=-1) <= NEAR * spacing
+    pairs = found.mutual.sum(-1)
+    smaller = torch.minimum(_count(pair.P, pair.P_mask), _count(pair.Q, pair.Q_mask))
+    shares = [(found.mutual & which).sum(-1) / pairs.clamp(min=1) for which in (on_plane, near)]
+    return torch.stack((pairs / smaller.clamp(min=1), *shares), -1).double()
+
+
+def _count(points: Tensor, mask: Tensor | None) -> Tensor:
+    return torch.full_like(points[:, 0, 0], points.shape[1], dtype=torch.int64) if mask is None else mask.sum(-1)
+
+
+def _gaps(points: Tensor, mask: Tensor | None) -> Tensor:
+    """Distance of each point to the next one of its own cloud, ``(batch, n)`` float64."""
+    index = nearest_neighbours(points, 2, mask)[..., 1:]
+    next_ones = points.gather(1, index.expand_as(points))
+    return torch.linalg.vector_norm((points - next_ones).double(), dim=-1)
+
+
+def _judged(points: Tensor, normals: Tensor | None, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Points, normals and mask of one cloud, thinned."""
+    if points.shape[1] > JUDGED_POINTS:
+        drawn = [_drawn(points.shape[1], None if mask is None else mask[b]) for b in range(len(points))]
+        rows = torch.from_numpy(np.stack([np.pad(real, (0, JUDGED_POINTS - len(real))) for real in drawn]))
+        rows = rows.to(points.device)[..., None].expand(-1, -1, points.shape[-1])
+        counts = torch.tensor([len(real) for real in drawn], device=points.device)
+        points, normals = points.gather(1, rows), None if normals is None else normals.gather(1, rows)
+        mask = torch.arange(JUDGED_POINTS, device=points.device) < counts[:, None]
+    return points, estimate_normals(points, mask=mask) if normals is None else normals, mask
+
+
+def _drawn(count: int, mask: Tensor | None) -> np.ndarray:
+    real = np.arange(count) if mask is None else mask.nonzero()[:, 0].cpu().numpy()
+    return real[np.random.default_rng(0).permutation(len(real))[:JUDGED_POINTS]]
