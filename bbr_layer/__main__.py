@@ -13,8 +13,9 @@ from bbr_layer.answer import described, show, write_moved
 from bbr_layer.atomic import writable_path
 from bbr_layer.cloud_writing import writer_of
 from bbr_layer.clouds import read_cloud
+from bbr_layer.named_stages import SOFT_POINTS
 from bbr_layer.trajectories import read_motion
-from bbr_layer.two_clouds import DEFAULT_LOSS, SOFT_POINTS, common_dimension, register_clouds
+from bbr_layer.two_clouds import DEFAULT_LOSS, common_dimension, register_clouds
 
 BAD_INPUT = 2  # the exit code that command lines give to wrong arguments
 
@@ -31,6 +32,14 @@ class LossName(StrEnum):
     F = "F"
 
 
+class Preset(StrEnum):
+    """The layers that are measured."""
+
+    DEFAULT = "default"
+    FAST = "fast"
+    ROBUST = "robust"
+
+
 @app.callback()
 def main() -> None:
     """Best Buddies Registration of point clouds."""
@@ -41,13 +50,13 @@ def register(
     target: Annotated[Path, typer.Argument(help="The cloud that stays: .ply .pcd .bin .las .npz .xyz .csv ...")],
     source: Annotated[Path, typer.Argument(help="The cloud that is moved onto it.")],
     *,
-    loss: Annotated[LossName, typer.Option(help="One loss alone, or soft buddies then F.")] = LossName.DEFAULT,
+    preset: Annotated[Preset, typer.Option(help="The default, fewer steps, or several starts.")] = Preset.DEFAULT,
+    loss: Annotated[LossName, typer.Option(help="One loss alone instead of a preset.")] = LossName.DEFAULT,
     out: Annotated[Path | None, typer.Option(help="Write the moved source here: .ply .pcd .npz .csv .xyz")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Answer in JSON and nothing else.")] = False,
     start: Annotated[Path | None, typer.Option(help="A text file: the 4 x 4 target_from_source to begin with.")] = None,
-    starts: Annotated[int, typer.Option(help="Starting rotations tried by the soft stage; 7 for far turns.")] = 1,
-    points: Annotated[int, typer.Option(help="Points of each cloud in the soft stage.")] = SOFT_POINTS,
-    seed: Annotated[int, typer.Option(help="Of the random choice of points.")] = 0,
+    starts: Annotated[int | None, typer.Option(help="Starting rotations tried by the first stage; robust: 7.")] = None,
+    points: Annotated[int, typer.Option(help="Most points of each cloud in the soft stage.")] = SOFT_POINTS,
 ) -> None:
     """Find the motion that carries SOURCE onto TARGET, and say how far to trust it."""
     try:
@@ -56,7 +65,9 @@ def register(
         whole = read_cloud(source)
         P, Q = common_dimension(read_cloud(target), whole)
         begun = None if start is None else _of_dimension(read_motion(start), P.points.shape[1])
-        found = register_clouds(P, Q, loss=loss.value, start=begun, starts=starts, soft_points=points, seed=seed)
+        found = register_clouds(
+            P, Q, loss=loss.value, preset=preset.value, start=begun, starts=starts, soft_points=points
+        )
         answer = described(found, P, Q)
         if out is not None:
             write_moved(out, whole, np.array(answer["target_from_source"]))

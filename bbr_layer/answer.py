@@ -32,7 +32,6 @@ def described(found: TwoClouds, target: Cloud, source: Cloud) -> dict[str, Any]:
         "confidence": verdict.confidence,
         "weakest_direction": _plain(_of_one(found)[0]),
         "free_directions": [_plain(direction) for direction in _of_one(found) if direction.free],
-        "points_used": {"target": found.target_points, "source": found.source_points},
         "points_read": {"target": len(target.points), "source": len(source.points)},
         "points_dropped": {"target": target.dropped, "source": source.dropped},
     }
@@ -81,7 +80,7 @@ def show(console: Console, found: TwoClouds, answer: dict[str, Any], out: Path |
     console.print("target_from_source (x_target = R x_source + t)", highlight=False)
     for row in answer["target_from_source"]:
         console.print("  " + " ".join(f"{number:15.9f}" for number in row), highlight=False, soft_wrap=True)
-    used, read = answer["points_used"], answer["points_read"]
+    read = answer["points_read"]
     directions = _of_one(found)
     weak = [direction for direction in directions if direction.free] or directions[:1]
     table = Table(show_header=False, box=None, pad_edge=False)
@@ -89,11 +88,11 @@ def show(console: Console, found: TwoClouds, answer: dict[str, Any], out: Path |
         ("rotation", f"{answer['rotation_angle_deg']:.4f} deg"),
         ("translation", "  ".join(f"{number:.6g}" for number in answer["translation"])),
         ("status", answer["status"]),
-        ("best buddies", f"{answer['buddies']}, {answer['buddy_share']:.1%} of the points compared"),
+        ("best buddies", f"{answer['buddies']}, {answer['buddy_share']:.1%} of the smaller cloud's points"),
         ("their RMS distance", f"{answer['residual_rms']:.4g}"),
         ("confidence", f"{answer['confidence']:.2f}"),
         *(("free direction" if direction.free else "weakest direction", direction.words) for direction in weak),
-        ("points compared", f"{used['target']} of {read['target']} and {used['source']} of {read['source']}"),
+        ("points", f"{read['target']} and {read['source']}"),
     ):
         table.add_row(f"{name}  ", escape(words))
     console.print(table)

@@ -4,7 +4,6 @@ Right means: rotation at most 5 degrees off, and the source's points at most 5 p
 from where they belong, on average. How well it is calibrated: docs/trust.md.
 """
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,6 +12,7 @@ from bbr_layer.matches import Matches
 from bbr_layer.neighbourhoods import nearest_neighbours
 from bbr_layer.normals import estimate_normals
 from bbr_layer.pair import CloudPair
+from bbr_layer.thinning import thinned_pair
 
 # Points of each cloud that are judged: with 10 000 the sensor's noise is wider than the spacing, and fewer pairs of
 # right answers are close; with 1000 to 4000 it is not so.
@@ -28,10 +28,21 @@ COEFFICIENTS = (-65.28, 8.95, 33.81, 35.42)
 
 @torch.no_grad()
 def judged_clouds(pair: CloudPair) -> CloudPair:
-    """At most 2000 points of each cloud, drawn by a fixed seed, and their normals."""
-    P, P_normals, P_mask = _judged(pair.P, pair.P_normals, pair.P_mask)
-    Q, Q_normals, Q_mask = _judged(pair.Q, pair.Q_normals, pair.Q_mask)
-    return CloudPair(P, Q, P_normals, Q_normals, P_mask=P_mask, Q_mask=Q_mask)
+    """At most 2000 points of each cloud, spread evenly, and their normals; those given, where all points are judged.
+
+    Normals of a dense cloud follow its noise; those of the judged points are like those of the fit.
+    """
+    thin = thinned_pair(pair._replace(P_features=None, Q_features=None), JUDGED_POINTS)
+    P_normals, Q_normals = (
+        kept if few.shape[1] == all_points.shape[1] else None
+        for few, all_points, kept in ((thin.P, pair.P, pair.P_normals), (thin.Q, pair.Q, pair.Q_normals))
+    )
+    return thin._replace(
+        P_normals=_with_normals(thin.P, P_normals, thin.P_mask),
+        Q_normals=_with_normals(thin.Q, Q_normals, thin.Q_mask),
+        P_weights=None,
+        Q_weights=None,
+    )
 
 
 @torch.no_grad()
@@ -76,18 +87,5 @@ def _gaps(points: Tensor, mask: Tensor | None) -> Tensor:
     return torch.linalg.vector_norm((points - next_ones).double(), dim=-1)
 
 
-def _judged(points: Tensor, normals: Tensor | None, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Points, normals and mask of one cloud, thinned."""
-    if points.shape[1] > JUDGED_POINTS:
-        drawn = [_drawn(points.shape[1], None if mask is None else mask[b]) for b in range(len(points))]
-        rows = torch.from_numpy(np.stack([np.pad(real, (0, JUDGED_POINTS - len(real))) for real in drawn]))
-        rows = rows.to(points.device)[..., None].expand(-1, -1, points.shape[-1])
-        counts = torch.tensor([len(real) for real in drawn], device=points.device)
-        points, normals = points.gather(1, rows), None if normals is None else normals.gather(1, rows)
-        mask = torch.arange(JUDGED_POINTS, device=points.device) < counts[:, None]
-    return points, estimate_normals(points, mask=mask) if normals is None else normals, mask
-
-
-def _drawn(count: int, mask: Tensor | None) -> np.ndarray:
-    real = np.arange(count) if mask is None else mask.nonzero()[:, 0].cpu().numpy()
-    return real[np.random.default_rng(0).permutation(len(real))[:JUDGED_POINTS]]
+def _with_normals(points: Tensor, normals: Tensor | None, mask: Tensor | None) -> Tensor:
+    return estimate_normals(points, mask=mask) if normals is None else normals

@@ -18,19 +18,19 @@ SOFT_POINTS, FAST_SOFT_POINTS = 1000, 300
 FINE_POINTS = 10_000
 
 
-def default_stages() -> list[Stage]:
+def default_stages(soft_points: int = SOFT_POINTS) -> list[Stage]:
     """Soft buddies for the basin, then hard ones on planes for the accuracy; scale-free, measured.
 
     Of more than 10 000 points the first steps see fewer, and the last 30 all.
     """
-    soft = Stage(SoftBBS(smoothing=SOFT_SMOOTHING), Adam(60, 0.1), Annealed(2.0, 1.0), points=SOFT_POINTS)
+    soft = Stage(SoftBBS(smoothing=SOFT_SMOOTHING), Adam(60, 0.1), Annealed(2.0, 1.0), points=soft_points)
     fine = Stage(BuddyFilter(), Adam(200, 0.005), Annealed(0.3, 0.03), points=FINE_POINTS)
     return [soft, fine, Stage(BuddyFilter(), Adam(30, 0.001), Annealed(0.3, 0.03), above=FINE_POINTS)]
 
 
-def fast_stages() -> list[Stage]:
+def fast_stages(soft_points: int = FAST_SOFT_POINTS) -> list[Stage]:
     """The same with soft buddies of fewer points and Gauss-Newton instead of most steps."""
-    soft = Stage(SoftBBS(smoothing=SOFT_SMOOTHING), Adam(40, 0.1), Annealed(2.0, 1.0), points=FAST_SOFT_POINTS)
+    soft = Stage(SoftBBS(smoothing=SOFT_SMOOTHING), Adam(40, 0.1), Annealed(2.0, 1.0), points=soft_points)
     fine = Stage(BuddyFilter(), GaussNewton(8), Annealed(0.3, 0.03), points=FINE_POINTS)
     return [soft, fine, Stage(BuddyFilter(), GaussNewton(3), Annealed(0.1, 0.03), above=FINE_POINTS)]
 

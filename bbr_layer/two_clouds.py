@@ -1,4 +1,4 @@
-"""Two whole clouds registered: thinned for the soft stage, refined on more points, judged."""
+"""Two whole clouds registered and judged."""
 
 from typing import NamedTuple
 
@@ -9,33 +9,21 @@ from jaxtyping import Float
 from bbr_layer.backward import Detached
 from bbr_layer.clouds import Cloud
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.layer import BBRLayer
-from bbr_layer.normals import estimate_normals
+from bbr_layer.layer import ROBUST_STARTS, BBRLayer
+from bbr_layer.named_stages import FAST_SOFT_POINTS, SOFT_POINTS, default_stages, fast_stages, named_stage
 from bbr_layer.registration import Registration
+from bbr_layer.stage import Stage
 from bbr_layer.verdict import Verdict, give_verdict
 
 DEFAULT_LOSS = "default"
-# Points of each cloud in the soft stages, whose cost grows with the square: 0.1 deg on real scans.
-SOFT_POINTS = 1000
-# Points of each cloud for F, whose cost grows with the number: on a street 0.01 deg, ten times less than with 1000.
-FINE_POINTS = 10_000
-# Neighbours of the plane fit when normals are not in the files: the paper's number for clouds of many points.
-FINE_NEIGHBOURS = 13
 
 
 class TwoClouds(NamedTuple):
-    """A registration of two files' clouds; ``registration`` and ``verdict`` are of the thinned ones."""
+    """A registration of two files' clouds, and what is to be thought of it."""
 
     registration: Registration
     verdict: Verdict
     target_from_source: Float[np.ndarray, "d1 d1"]
-    target_points: int
-    source_points: int
-
-
-class _Sample(NamedTuple):
-    points: torch.Tensor
-    normals: torch.Tensor
 
 
 def register_clouds(
@@ -43,48 +31,51 @@ def register_clouds(
     source: Cloud,
     *,
     loss: str = DEFAULT_LOSS,
+    preset: str = DEFAULT_LOSS,
     start: Float[np.ndarray, "d1 d1"] | None = None,
-    starts: int = 1,
+    starts: int | None = None,
     soft_points: int = SOFT_POINTS,
-    seed: int = 0,
 ) -> TwoClouds:
     """Find the motion that carries ``source`` onto ``target``, and say how far to trust it.
 
     Parameters
     ----------
     target, source: clouds of one dimension, see ``common_dimension``.
-    loss: "softBBS", "softBD", "N" or "F" alone; "default": soft buddies, then F, then F on more points.
+    loss: "softBBS", "softBD", "N" or "F" alone; "default": what the preset has.
+    preset: "default", "fast" (``BBRLayer.fast()``) or "robust" (``BBRLayer.robust()``).
     start: ``(d + 1, d + 1)`` target_from_source to begin with; None: in place or centroid on centroid.
-    starts: how many starting rotations the first stage tries, see ``BBRLayer``.
-    soft_points: how many points of each cloud the soft stages see, drawn at random.
-    seed: of that draw.
+    starts: how many starting rotations the first stage tries, see ``BBRLayer``; None: as the preset has it.
+    soft_points: how many points of each cloud the soft stages see, spread evenly.
 
     Raises
     ------
     ValueError: settings or clouds that cannot be registered, or an answer that is not finite.
     """
-    if soft_points < 2:
-        raise ValueError(f"points is {soft_points}; a registration needs at least 2 of each cloud: try {SOFT_POINTS}")
     d = target.points.shape[1]
     for name, cloud in (("target", target), ("source", source)):
         if len(cloud.points) <= d:
             raise ValueError(f"the {name} has {len(cloud.points)} points; in {d}D at least {d + 1} are needed")
     motion = None if start is None else RigidMotion.from_matrix(torch.as_tensor(start, dtype=torch.float64))
-    draw = np.random.default_rng(seed)
-    if loss == DEFAULT_LOSS:
-        P, Q = (_sample(cloud, soft_points, draw) for cloud in (target, source))
-        motion = _run(BBRLayer(backward=Detached(), starts=starts), P, Q, motion).target_from_source
-        last = BBRLayer("F", backward=Detached())
-    else:
-        last = BBRLayer(loss, backward=Detached(), starts=starts)
-    count = max(FINE_POINTS, soft_points) if loss in (DEFAULT_LOSS, "F") else soft_points
-    P, Q = (_sample(cloud, count, draw) for cloud in (target, source))
-    result = _run(last, P, Q, motion)
+    many = starts if starts is not None else ROBUST_STARTS if preset == "robust" else 1
+    layer = BBRLayer(*_stages(loss, preset, soft_points), backward=Detached(), starts=many)
+    P, Q = (torch.from_numpy(cloud.points) for cloud in (target, source))
+    normals = [None if cloud.normals is None else torch.from_numpy(cloud.normals) for cloud in (target, source)]
+    result = layer(P, Q, P_normals=normals[0], Q_normals=normals[1], start=motion)
     if not np.isfinite(result.target_from_source.matrix.numpy()).all():
         raise ValueError(str(result.words))
-    moved = result.target_from_source(Q.points).numpy()
-    verdict = give_verdict(P.points.numpy(), moved, float(result.confidence), str(result.words))
-    return TwoClouds(result, verdict, result.target_from_source.matrix.numpy(), len(P.points), len(Q.points))
+    moved = result.target_from_source(Q).numpy()
+    verdict = give_verdict(target.points, moved, float(result.confidence), str(result.words))
+    return TwoClouds(result, verdict, result.target_from_source.matrix.numpy())
+
+
+def _stages(loss: str, preset: str, soft_points: int) -> list[Stage]:
+    if loss == DEFAULT_LOSS:
+        return fast_stages(min(soft_points, FAST_SOFT_POINTS)) if preset == "fast" else default_stages(soft_points)
+    if preset != DEFAULT_LOSS:
+        raise ValueError(f"loss is {loss} and preset is {preset}; a preset has its own losses: give one of the two")
+    stage = named_stage(loss)
+    points = None if loss == "F" else soft_points
+    return [Stage(stage.loss, stage.inner, stage.temperature, points=points)]
 
 
 def common_dimension(target: Cloud, source: Cloud) -> tuple[Cloud, Cloud]:
@@ -107,15 +98,3 @@ def _flattened(cloud: Cloud) -> Cloud:
     if normals is not None and not np.allclose(np.linalg.norm(normals, axis=1), 1.0):
         normals = None
     return Cloud(cloud.points[:, :2], normals, cloud.intensity, cloud.dropped)
-
-
-def _sample(cloud: Cloud, count: int, draw: np.random.Generator) -> _Sample:
-    chosen = np.sort(draw.permutation(len(cloud.points))[:count])
-    points = torch.from_numpy(cloud.points[chosen])
-    if cloud.normals is not None:
-        return _Sample(points, torch.from_numpy(cloud.normals[chosen]))
-    return _Sample(points, estimate_normals(points, min(FINE_NEIGHBOURS, len(points))))
-
-
-def _run(layer: BBRLayer, P: _Sample, Q: _Sample, start: RigidMotion | None) -> Registration:
-    return layer(P.points, Q.points, P_normals=P.normals, Q_normals=Q.normals, start=start)

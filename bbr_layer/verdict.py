@@ -71,6 +71,6 @@ def _doubts(status_words: str, confidence: float) -> list[str]:
 
 def _sentence(doubts: list[str], confidence: float) -> str:
     if doubts:
-        advice = "Try several starts (--starts 7), or one near the answer (--start)."
+        advice = "Try several starts (--preset robust), or one near the answer (--start)."
         return f"Do not trust this without a look: {'; '.join(doubts)}. {advice}"
     return f"Trustworthy: the probability that it is right is {confidence:.2f}."

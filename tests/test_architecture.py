@@ -37,7 +37,7 @@ ORDER = {
         kernels.soft
         loss_base
         losses
-        matches directions start door
+        matches directions start door thinning
         confidence resistance
         registration
         inner
@@ -48,7 +48,6 @@ ORDER = {
         inner.compiled_scene inner.matched_scene inner.walk
         inner.run inner.implicit
         backward transforms preparation
-        thinning
         stage
         named_stages starts descent
         layer

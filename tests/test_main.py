@@ -80,10 +80,12 @@ def test_people_read_the_motion_the_pairs_and_a_verdict(files):
     assert np.array(rows, dtype=float)[3].tolist() == [0, 0, 0, 1]
 
 
-def test_the_same_seed_gives_the_same_answer(files):
-    first, again, other = (run(*files, "--json", "--points", 100, "--seed", seed).stdout for seed in (1, 1, 2))
+@pytest.mark.parametrize("preset", ["default", "fast", "robust"])
+def test_presets_find_the_motion_and_find_it_again(files, motion, preset):
+    first, again = (run(*files, "--json", "--points", 100, "--preset", preset).stdout for _ in range(2))
     assert first == again
-    assert first != other
+    found = np.array(json.loads(first)["target_from_source"])
+    assert np.degrees(Rotation.from_matrix(found[:3, :3].T @ motion[:3, :3]).magnitude()) < 1.0
 
 
 def test_the_moved_source_lies_on_the_target(files, tmp_path, motion):
@@ -158,6 +160,7 @@ def test_bad_input_is_told_in_one_sentence(files, tmp_path):
         ((target, source, "--out", tmp_path / "a.gif"), "suffix '.gif'; writable are"),
         ((target, source, "--start", tmp_path / "start.txt"), "start.txt has poses of shape (1, 1, 3)"),
         ((target, source, "--points", 1), "points is 1"),
+        ((target, source, "--preset", "fast", "--loss", "F"), "loss is F and preset is fast"),
         ((target, tmp_path / "one.csv"), "the source has 1 points; in 3D at least 4"),
         ((target, tmp_path / "flat.csv"), "one cloud is 2D and the other 3D"),
     ):
