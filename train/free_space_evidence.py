@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from train.scans import ScanSet
-from train.shape_features import seen_from_origin
+from train.shape_features import common_view
 from train.surfaces import Surface
 
 # A ray saw through a point when it, and the others next to it, went on beyond by this share of their length: less may
@@ -43,7 +43,7 @@ class RangeView:
 
 def range_views(scans: ScanSet, thinned: Sequence[Surface]) -> list[RangeView | None]:
     """The view of each scan; None for all where the scans were not seen from their origin."""
-    if np.mean([seen_from_origin(scan) for scan in thinned]) < 0.5:
+    if common_view(thinned) != 0:
         return [None] * len(scans)
     return [_view(points) for points in scans.points]
 

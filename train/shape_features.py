@@ -3,6 +3,8 @@
 Source: R. Rusu, N. Blodow, M. Beetz, Fast Point Feature Histograms for 3D Registration, ICRA 2009.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
@@ -20,29 +22,22 @@ RADIUS = 6.0
 APART, FEWER = -0.5, 0.01
 
 
-def outward(scan: Surface) -> Float[np.ndarray, "n d"]:
-    """Normals with their signs chosen alike in every scan: towards what the scan was seen from.
+def common_view(scans: Sequence[Surface]) -> int:
+    """From where the scans were seen: 0 for their origin, i for far off along axis i - 1.
 
-    A surface shows its sensor one side, so that signs chosen towards it change nowhere between neighbours. Where the
-    origin is not the sensor they do; then it is taken to have looked along the axis for which they change least.
+    A surface shows its sensor one side, so that normals turned towards it change their sides nowhere between
+    neighbours. Where the origin is not the sensor they do; then the axis is taken for which they change least.
     """
-    return _turned(scan, _view(scan))
-
-
-def seen_from_origin(scan: Surface) -> bool:
-    """Whether the sensor seems to have been at the origin, and not far off along an axis."""
-    return _view(scan) == 0
-
-
-def _view(scan: Surface) -> int:
-    """0 for the origin, i for far off along axis i - 1: from where the fewest neighbours are seen from behind."""
-    near = scan.tree.query(scan.points, k=min(6, len(scan.points)))[1][:, 1:]
-    behind = []
-    for view in range(scan.points.shape[1] + 1):
-        normals = _turned(scan, view)
-        behind.append(np.mean(np.einsum("nd,nkd->nk", normals, normals[near]) < APART))
+    views = range(scans[0].points.shape[1] + 1)
+    behind = np.mean([[_behind(scan, view) for view in views] for scan in scans], axis=0)
     best = int(np.argmin(behind))
     return best if behind[best] < behind[0] - FEWER else 0
+
+
+def _behind(scan: Surface, view: int) -> float:
+    near = scan.tree.query(scan.points, k=min(6, len(scan.points)))[1][:, 1:]
+    normals = _turned(scan, view)
+    return float(np.mean(np.einsum("nd,nkd->nk", normals, normals[near]) < APART))
 
 
 def _turned(scan: Surface, view: int) -> Float[np.ndarray, "n d"]:
@@ -50,9 +45,9 @@ def _turned(scan: Surface, view: int) -> Float[np.ndarray, "n d"]:
     return scan.normals * np.where((scan.normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
 
-def shape_features(scan: Surface, radius: float) -> Float[np.ndarray, "n 33"]:
-    """Histograms of the angles between each point's normal and those of its neighbours within ``radius``."""
-    normals, tree = outward(scan), scan.tree
+def shape_features(scan: Surface, radius: float, view: int) -> Float[np.ndarray, "n 33"]:
+    """Histograms of the angles between each point's normal and those of its neighbours within ``radius``; ``view`` as of all scans."""
+    normals, tree = _turned(scan, view), scan.tree
     pairs = tree.sparse_distance_matrix(tree, radius, output_type="ndarray")
     pairs = pairs[pairs["i"] != pairs["j"]]
     here, there, apart = pairs["i"], pairs["j"], np.maximum(pairs["v"], 1e-12)
@@ -82,6 +77,12 @@ def shape_features(scan: Surface, radius: float) -> Float[np.ndarray, "n 33"]:
     return whole / np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-12)
 
 
-def matches(target: Float[np.ndarray, "n f"], source: Float[np.ndarray, "m f"]) -> Float[np.ndarray, "c 2"]:
-    """Each source point with the target point of the nearest feature: numbers, target then source."""
-    return np.column_stack((cKDTree(target).query(source)[1], np.arange(len(source))))
+def matched(
+    target: Float[np.ndarray, "n f"], source: Float[np.ndarray, "m f"], most: int
+) -> Float[np.ndarray, "c 2"]:
+    """Point numbers, target then source, of at most ``most`` pairs of which one is the nearest in features, best first."""
+    there, back = cKDTree(target).query(source)[1], cKDTree(source).query(target)[1]
+    pairs = np.concatenate((np.column_stack((there, np.arange(len(source)))), np.column_stack((np.arange(len(target)), back))))
+    pairs = np.unique(pairs, axis=0)
+    apart = np.linalg.norm(target[pairs[:, 0]] - source[pairs[:, 1]], axis=1)
+    return pairs[np.argsort(apart, kind="stable")[:most]]
