@@ -1,7 +1,7 @@
-"""The real sequences of the table of maps, as they are and made harder: gaps, noise, people in the way, a narrow view.
+"""The real sequences of the table of maps, as they are and made harder: gaps, noise, movers, a narrow view.
 
-People in the way: six discs around the sensor, placed by the true poses. Every second one goes along with the sensor, now
-before it, now beside it; the others cross its way in straight lines and begin anew when they are out of reach. A ray ends at
+Movers: six discs around the sensor, placed by the true poses. Every second one goes along with the sensor, now before
+it, now beside it; the others cross its way in straight lines and begin anew when they are out of reach. A ray ends at
 the first disc it meets before its wall. One factor on all radii is chosen so that the discs hide the wanted share of
 all rays of the sequence.
 """

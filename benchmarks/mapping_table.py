@@ -44,16 +44,22 @@ def line(name: str, found: dict[str, float]) -> str:
     verdict = "met" if error <= row.wanted else f"**{error / row.wanted:.3g} x**"
     points = f"{found['point_rms_displacement']:.3g}" if "point_rms_displacement" in found else ""
     cells = (name, f"{found['scans']:.0f}", f"{found['ape_rmse']:.3g}", points, unit, f"{found['degrees']:.2g}")
-    rest = (f"{row.wanted:g}", verdict, f"{found['edges']:.0f}", f"{found['seconds']:.0f}", f"{found['CPU seconds']:.0f}")
+    rest = (
+        f"{row.wanted:g}",
+        verdict,
+        f"{found['edges']:.0f}",
+        f"{found['seconds']:.0f}",
+        f"{found['CPU seconds']:.0f}",
+    )
     return "| " + " | ".join(cells + rest) + " |"
 
 
 def table(results: dict[str, dict[str, float]]) -> str:
     """The whole table, rows in their order."""
     head = (
-        "Made by `python -m benchmarks.mapping_table`, one thread, the default configuration for every row; maps of the\n"
-        "registered edges, before any training. ATE: RMSE of the positions after rigid alignment; points: RMS displacement\n"
-        "of the scanned points; wanted: of the points for the last three rows, of the positions for the others.\n"
+        "Made by `python -m benchmarks.mapping_table`, one thread, the default configuration for every row; maps of\n"
+        "the registered edges, before any training. ATE: RMSE of the positions after rigid alignment; points: RMS\n"
+        "displacement of the scanned points; wanted: of the points for the last three rows, else of the positions.\n"
     )
     titles = "| sequence | scans | ATE | points | unit | rotation, deg | wanted | | edges | seconds | CPU seconds |"
     lines = [head, titles, "|---" * 11 + "|"] + [line(name, results[name]) for name in ROWS if name in results]

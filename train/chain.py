@@ -78,9 +78,7 @@ def _motions_around(motion: RigidMotion) -> RigidMotion:
 def _apart(scene: Scene, edges: Edges, other: RigidMotion) -> Tensor:
     """Root mean square distance between the source's points under the edges' motion and under the other, ``(e,)``."""
     clouds = [torch.from_numpy(scene.surfaces[number].points) for number in edges.source.tolist()]
-    moves = [
-        edges.target_from_source.item(edge)(cloud) - other.item(edge)(cloud) for edge, cloud in enumerate(clouds)
-    ]
+    moves = [edges.target_from_source.item(edge)(cloud) - other.item(edge)(cloud) for edge, cloud in enumerate(clouds)]
     return torch.stack([move.square().sum(-1).mean().sqrt() for move in moves])
 
 

@@ -1,4 +1,4 @@
-"""Which scans are compared with which, and what the layer answers: neighbours, window, loops, pose graph, refinement."""
+"""Scans to poses: neighbours, window and loops registered by the layer, a pose graph, a refinement of all poses."""
 
 import numpy as np
 import torch
@@ -54,12 +54,12 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
     weights = _point_weights(scene, edges, poses)
     for _ in range(config.rounds if config.loops_per_scan else 0):
         edges = _again(scene, edges, belief, poses, weights)
-        loops = _loops(scene, poses, edges, config, progress, weights=weights)
-        edges = edges.kept(edges.kind < 2).joined(loops)
+        edges = edges.kept((edges.kind < 2) | (belief >= DOUBTED))
+        edges = edges.joined(_loops(scene, poses, edges, config, progress, weights=weights))
         poses, belief = solve_pose_graph(edges, poses)
         weights = _point_weights(scene, edges, poses)
     edges = edges._replace(score=edges.score * belief)
-    return edges, _refined(full, scene, edges, belief, poses, progress)
+    return edges, _refined(full, scene, (edges, belief), poses, progress)
 
 
 def _window(scene: Scene, poses: RigidMotion, window: int, progress: Progress) -> Edges:
@@ -81,7 +81,8 @@ def _again(scene: Scene, edges: Edges, belief: Tensor, poses: RigidMotion, weigh
     found = register_pairs(scene, (few.target, few.source), start, 1, weights=weights)._replace(kind=few.kind)
     rest = torch.ones(len(edges.score), dtype=torch.bool)
     rest[doubted] = False
-    return edges.kept(rest).joined(better(found, few))
+    order = torch.cat((torch.nonzero(rest)[:, 0], doubted)).argsort()
+    return edges.kept(rest).joined(better(found, few)).kept(order)
 
 
 def _loops(
@@ -93,17 +94,18 @@ def _loops(
     *,
     weights: PointWeights,
 ) -> Edges:
-    """Scans that the current poses put close together though far apart in time, as far as they agree."""
+    """Scans that the poses put close together though far apart in time, not joined yet, as far as they agree."""
     places = poses.translation.numpy()
     prepared = scene.prepared
     radius = torch.linalg.vector_norm(prepared.points, dim=-1)[prepared.mask].median().item()
     apart = LOOP_WINDOWS * max(config.window, 2)
+    joined = set(zip(edges.target.tolist(), edges.source.tolist(), strict=True))
     pairs = []
     for i, near in enumerate(cKDTree(places).query_ball_point(places, LOOP_REACH * radius)):
         distances = np.linalg.norm(places - places[i], axis=1)
         later = sorted((j for j in near if j >= i + apart), key=distances.__getitem__)
         spread = later[:: max(1, len(later) // max(config.loops_per_scan, 1))]
-        pairs += [(i, j) for j in spread[: config.loops_per_scan]]
+        pairs += [(i, j) for j in spread[: config.loops_per_scan] if (i, j) not in joined]
     if not pairs:
         return edges.kept(edges.kind < 0)
     target, source = torch.tensor(pairs).unbind(1)
@@ -119,14 +121,14 @@ def _point_weights(scene: Scene, edges: Edges, poses: RigidMotion) -> PointWeigh
     clouds = [scan.points for scan in scene.surfaces]
     pairs = torch.stack((edges.target, edges.source), 1).numpy()
     evidence = point_evidence(clouds, (scene.surfaces, scene.views), pairs, poses.matrix.numpy())
-    return torch.nn.utils.rnn.pad_sequence(
-        [torch.from_numpy(one.weight).float() for one in evidence], batch_first=True
-    )
+    return torch.nn.utils.rnn.pad_sequence([torch.from_numpy(one.weight).float() for one in evidence], batch_first=True)
 
 
 def _refined(
-    full: Prepared, scene: Scene, edges: Edges, belief: Tensor, poses: RigidMotion, progress: Progress
+    full: Prepared, scene: Scene, graph: tuple[Edges, Tensor], poses: RigidMotion, progress: Progress
 ) -> RigidMotion:
+    """Poses at which all scans' points agree; ``graph``: the edges, and how far each was believed."""
+    edges, belief = graph
     clouds = surfaces(full)
     pairs = torch.stack((edges.target, edges.source), 1).numpy()
     found = poses.matrix.numpy()

@@ -13,9 +13,9 @@ from train.shape_features import matched
 
 # Pairs registered as one batch, and between two reports of progress.
 BATCH = 32
-# F's steps and first rate: benchmarks/mapping_sequences.md has the errors; 60 at 0.02 left more than twice that of
-# v1_pose0. Twice the layer's own rate, as scans lie farther apart than what soft buddies leave.
-EDGE_STEPS, EDGE_RATE = 200, 0.01
+# F's steps by kind of edge, and its first rate, twice the layer's own: neighbours start from afar, the others from
+# poses that are nearly right, and the refinement gives the accuracy (benchmarks/mapping_table.md).
+EDGE_STEPS, EDGE_RATE = {0: 200, 1: 100, 2: 100}, 0.01
 # Points of a scan that soft buddies, whose cost grows with their square, are given.
 SOFT_POINTS = 400
 # Matches of features that are asked for a common motion, within this many spacings, and motions tried.
@@ -43,7 +43,7 @@ def register_pairs(
     """
     target, source = pairs
     prepared = scene.prepared
-    layer = BBRLayer("F", inner=Adam(EDGE_STEPS, EDGE_RATE), backward=Detached())
+    layer = BBRLayer("F", inner=Adam(EDGE_STEPS[kind], EDGE_RATE), backward=Detached())
     results = []
     for begin in range(0, len(target), BATCH):
         progress(STAGE_NAMES[kind], begin, len(target))
@@ -104,6 +104,6 @@ def softly(scene: Scene, pairs: tuple[Tensor, Tensor], start: RigidMotion) -> Ri
 
 
 def better(one: Edges, other: Edges) -> Edges:
-    """Of two registrations of the same pairs, in the same order, the better one each; the first where they are equal."""
+    """The better of two registrations of each pair, both in the same order; the first where they are equal."""
     count = len(one.score)
     return one.joined(other).kept(torch.arange(count) + count * (other.score > one.score))

@@ -87,7 +87,9 @@ def spanning_poses(edges: Edges, scans: int) -> RigidMotion:
         last = int(before[scan])
         forth = best.get((last, scan))
         motion = edges.target_from_source
-        poses[scan] = poses[last] @ (motion.item(forth) if forth is not None else motion.item(best[scan, last]).inverse())
+        poses[scan] = poses[last] @ (
+            motion.item(forth) if forth is not None else motion.item(best[scan, last]).inverse()
+        )
     return RigidMotion(*(torch.stack(field) for field in zip(*(poses[scan] for scan in range(scans)), strict=True)))
 
 

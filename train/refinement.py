@@ -1,7 +1,7 @@
 """All poses at once from all points: F's pairs (Eq. 8 of the paper) between the scans of every edge, by Gauss-Newton.
 
-A pose graph weighs what each edge found alone; here the pairs themselves pull, found anew at every step from the poses of
-all scans, and a pair far off its plane loses its weight (Geman-McClure) whatever edge it belongs to.
+A pose graph weighs what each edge found alone; here the pairs themselves pull, found anew at every step from the
+poses of all scans, and a pair far off its plane loses its weight (Geman-McClure) whatever edge it belongs to.
 """
 
 from collections.abc import Sequence
@@ -56,7 +56,10 @@ def refine(
     weights: of the edges, and of the points of each scan; not negative.
     progress: told each step.
     """
-    poses, width, first = world_from_scan.copy(), FIRST_WIDTH, world_from_scan[0].copy()
+    poses, width = world_from_scan.copy(), FIRST_WIDTH
+    reach = np.array([np.sqrt((scan.points**2).sum(axis=1).mean()) for scan in scans])
+    spacing = min(scan.spacing for scan in scans)
+    d = poses.shape[1] - 1
     used = weights[0] > 0
     edges, trust = edges[used], weights[0][used]
     for step in range(STEPS):
@@ -64,14 +67,14 @@ def refine(
         found = [mutual_pairs(scans, edge, poses) for edge in edges]
         moves, median = _gauss_newton(scans, (edges, found), poses, (trust, weights[1], width))
         poses = _moved(poses, moves)
-        spacing = min(scan.spacing for scan in scans)
-        settled = np.abs(moves).max() < SETTLED * spacing
+        turned, shifted = (np.linalg.norm(part, axis=1) for part in (moves[:, :-d], moves[:, -d:]))
+        settled = np.max(turned * reach + shifted) < SETTLED * spacing
         final = max(FINAL_WIDTH * median, FINEST_WIDTH)
         if settled and width <= final:
             break
         width = min(width, max(final, NARROWING * width))
     progress("refinement", STEPS, STEPS)
-    return first @ np.linalg.inv(poses[0]) @ poses
+    return poses
 
 
 def mutual_pairs(scans: Sequence[Surface], edge: Int[np.ndarray, "2"], poses: Float[np.ndarray, "k d1 d1"]) -> Pairs:
@@ -112,7 +115,9 @@ def _gauss_newton(
         apart = (offset**2).sum(axis=1) / (APART * spacing) ** 2
         weight = belief / ((1 + (off_plane / (width * spacing)) ** 2) * (1 + apart)) ** 2
         weight = weight * of_points[target][pairs.target_index] * of_points[source][pairs.source_index]
-        levers = [placed - poses[number, :-1, -1] for placed, number in ((pairs.target, target), (pairs.source, source))]
+        levers = [
+            placed - poses[number, :-1, -1] for placed, number in ((pairs.target, target), (pairs.source, source))
+        ]
         jacobian = np.concatenate((-_jacobian(levers[0], pairs.plane), _jacobian(levers[1], pairs.plane)), axis=1)
         weighted = jacobian * weight[:, None]
         blocks.append(weighted.T @ jacobian)
@@ -137,7 +142,8 @@ def _solved(
     places = (np.repeat(rows, 2 * size, axis=1).ravel(), np.tile(rows, (1, 2 * size)).ravel())
     hessian = csc_array(coo_array((blocks.ravel(), places), shape=(k * size, k * size)))[size:, size:]
     diagonal = hessian.diagonal()
-    hessian = hessian + csc_array(coo_array((DAMPING * (diagonal + diagonal.mean()), (np.arange(len(diagonal)),) * 2)))
+    damping = np.where(diagonal > 0, DAMPING * diagonal, 1.0)
+    hessian = hessian + csc_array(coo_array((damping, (np.arange(len(damping)),) * 2)))
     step = spsolve(csc_array(hessian), -forces.ravel()[size:])
     return np.concatenate((np.zeros(size), step)).reshape(k, size)
 
@@ -147,6 +153,6 @@ def _moved(poses: Float[np.ndarray, "k d1 d1"], moves: Float[np.ndarray, "k size
     turns = np.zeros((len(poses), 3))
     turns[:, 3 - (moves.shape[1] - d) :] = moves[:, :-d]  # in the plane a turn about z
     moved = poses.copy()
-    moved[:, :d, :d] = Rotation.from_rotvec(turns).as_matrix()[:, :d, :d] @ poses[:, :d, :d]
+    moved[1:, :d, :d] = Rotation.from_rotvec(turns[1:]).as_matrix()[:, :d, :d] @ poses[1:, :d, :d]
     moved[:, :d, d] += moves[:, -d:]
     return moved

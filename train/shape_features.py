@@ -6,7 +6,7 @@ Source: R. Rusu, N. Blodow, M. Beetz, Fast Point Feature Histograms for 3D Regis
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from train.surfaces import Surface
@@ -46,7 +46,7 @@ def _turned(scan: Surface, view: int) -> Float[np.ndarray, "n d"]:
 
 
 def shape_features(scan: Surface, radius: float, view: int) -> Float[np.ndarray, "n 33"]:
-    """Histograms of the angles between each point's normal and those of its neighbours within ``radius``; ``view`` as of all scans."""
+    """Histograms of the angles between the normals of points within ``radius``, with ``common_view`` of all scans."""
     normals, tree = _turned(scan, view), scan.tree
     pairs = tree.sparse_distance_matrix(tree, radius, output_type="ndarray")
     pairs = pairs[pairs["i"] != pairs["j"]]
@@ -73,16 +73,18 @@ def shape_features(scan: Surface, radius: float, view: int) -> Float[np.ndarray,
     whole = simple.copy()
     near = 1 / np.maximum(apart, radius / 10)
     for column in range(3 * BINS):
-        whole[:, column] += np.bincount(here, near * simple[there, column], minlength=n) / np.bincount(here, near, minlength=n).clip(1e-12)
+        whole[:, column] += np.bincount(here, near * simple[there, column], minlength=n) / np.bincount(
+            here, near, minlength=n
+        ).clip(1e-12)
     return whole / np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-12)
 
 
-def matched(
-    target: Float[np.ndarray, "n f"], source: Float[np.ndarray, "m f"], most: int
-) -> Float[np.ndarray, "c 2"]:
-    """Point numbers, target then source, of at most ``most`` pairs of which one is the nearest in features, best first."""
+def matched(target: Float[np.ndarray, "n f"], source: Float[np.ndarray, "m f"], most: int) -> Int[np.ndarray, "c 2"]:
+    """At most ``most`` pairs, target then source, where one is nearest to the other in features; best first."""
     there, back = cKDTree(target).query(source)[1], cKDTree(source).query(target)[1]
-    pairs = np.concatenate((np.column_stack((there, np.arange(len(source)))), np.column_stack((np.arange(len(target)), back))))
+    pairs = np.concatenate(
+        (np.column_stack((there, np.arange(len(source)))), np.column_stack((np.arange(len(target)), back)))
+    )
     pairs = np.unique(pairs, axis=0)
     apart = np.linalg.norm(target[pairs[:, 0]] - source[pairs[:, 1]], axis=1)
     return pairs[np.argsort(apart, kind="stable")[:most]]

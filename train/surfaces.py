@@ -29,7 +29,12 @@ def surfaces(prepared: Prepared) -> list[Surface]:
     for points, normals, mask in zip(*prepared, strict=True):
         chosen = points[mask].double().numpy()
         tree = cKDTree(chosen)
-        gaps = tree.query(chosen, k=2)[0][:, 1]
-        apart = gaps[np.isfinite(gaps) & (gaps > 0)]
-        found.append(Surface(chosen, normals[mask].double().numpy(), tree, float(np.median(apart)) if len(apart) else 1.0))
+        found.append(Surface(chosen, normals[mask].double().numpy(), tree, spacing_of(tree)))
     return found
+
+
+def spacing_of(tree: cKDTree) -> float:
+    """Median distance from a point to the nearest other one, duplicates left out; 1 where there is no other."""
+    gaps = tree.query(tree.data, k=[2])[0][:, 0]
+    apart = gaps[np.isfinite(gaps) & (gaps > 0)]
+    return float(np.median(apart)) if len(apart) else 1.0
