@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bbr_layer import RigidMotion
-from train.chain import all_pairs, consecutive
+from train.chain import POOR, all_pairs, consecutive
 from train.config import EdgeConfig
 from train.free_space_evidence import point_evidence
 from train.pair_registration import PointWeights, better, register_pairs
@@ -22,7 +22,7 @@ LOOP_SCORE = 0.8
 # Loop candidates lie within this part of the median scan radius of each other, and this many windows apart in time.
 LOOP_REACH = 0.5
 LOOP_WINDOWS = 3
-# Up to so many scans in space, all pairs are sought by features, in whatever order they come.
+# Of up to so many scans in space all pairs are sought by features when their chain is broken: they came in any order.
 FEW_SCANS = 20
 # Edges that the graph believes less are sought again from its poses, and count in the refinement only above this.
 DOUBTED = 0.3
@@ -45,7 +45,8 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
     full = prepare(scans, max(config.points, config.refined_points))
     scene = build_scene(scans, thinned(full, config.points))
     edges = consecutive(scene, scans, progress)
-    if scene.features and len(scans) <= FEW_SCANS:
+    broken = bool((edges.score < POOR * edges.score.median()).any())
+    if scene.features and broken and len(scans) <= FEW_SCANS:
         edges = edges.joined(all_pairs(scene, edges, progress))
     poses, belief = solve_pose_graph(edges, _anchored(spanning_poses(edges, len(scans)), scans))
     if (steps := min(config.window, len(scans) - 1)) > 1:
