@@ -3,7 +3,7 @@
     python -m benchmarks.mapping_table [--only v1_pose0 balm ...] [--again] [--out benchmarks/mapping_table.md]
 
 One configuration, the default, for everything; no starting poses, the truth is read for the errors alone. Rows that the
-results file (beside the table, .json) already holds are not measured again unless ``--again`` is given.
+results file (``out/benchmark``, named as the table) already holds are not measured again unless ``--again`` is given.
 """
 
 import argparse
@@ -74,7 +74,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("benchmarks", "mapping_table.md"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    kept = options.out.with_suffix(".json")
+    kept = Path("out", "benchmark", f"{options.out.stem}.json")
+    kept.parent.mkdir(parents=True, exist_ok=True)
     results = json.loads(kept.read_text()) if kept.exists() else {}
     chosen = [name for name in ROWS if name.startswith(tuple(options.only))]
     for name in chosen:
