@@ -79,9 +79,15 @@ ORDER = {
         evaluate drawing ros_map
         curves pictures browser_map
         config scans
-        prepared pose_graph
-        edges edge_files report run_folder
-        known_edges outputs
+        prepared pose_graph consensus
+        surfaces edge_files report run_folder
+        shape_features refinement
+        free_space_evidence
+        scene moving_points
+        pair_registration outputs
+        chain
+        edges
+        known_edges
         groups schedule
         data_module
         alignment mapping_module

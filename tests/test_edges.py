@@ -7,7 +7,7 @@ import torch
 from bbr_layer import RigidMotion, angular_error
 from train.config import EdgeConfig
 from train.edges import register_edges
-from train.pose_graph import Edges, chained, solve_pose_graph
+from train.pose_graph import Edges, solve_pose_graph, spanning_poses
 from train.prepared import prepare
 from train.scans import ScanSet
 
@@ -50,7 +50,7 @@ def test_pose_graph_finds_the_poses_and_drops_wrong_loops(d):
     wrong = wrong._replace(
         target_from_source=RigidMotion(wrong.target_from_source.rotation, wrong.target_from_source.translation + 2.0)
     )
-    poses, weights = solve_pose_graph(edges.joined(wrong), chained(edges, 20))
+    poses, weights = solve_pose_graph(edges.joined(wrong), spanning_poses(edges, 20))
     assert torch.equal(poses.translation[0], torch.zeros(d, dtype=torch.float64))
     assert (poses.translation - world.translation).norm(dim=-1).max() < 0.02
     assert angular_error(poses.rotation, world.rotation).max() < 0.01
@@ -67,9 +67,20 @@ def test_exact_edges_are_met_exactly_from_a_poor_start(d):
     torch.testing.assert_close(poses.matrix, world.matrix, rtol=0, atol=1e-7)
 
 
-def test_a_broken_chain_is_refused():
-    with pytest.raises(ValueError, match="3 consecutive edges were given; 6 scans need 5"):
-        chained(_edges(_circle(6, 2), [(0, 1), (1, 2), (2, 3)]), 6)
+def test_scans_that_no_edge_joins_are_refused():
+    with pytest.raises(ValueError, match="3 edges join 4 scans to the first; there are 6"):
+        spanning_poses(_edges(_circle(6, 2), [(0, 1), (1, 2), (2, 3)]), 6)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_first_poses_go_along_the_best_edges(d):
+    world = _circle(6, d)
+    edges = _edges(world, [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (1, 4), (0, 5)])
+    wrong = edges.target_from_source.translation.clone()
+    wrong[2] += 3.0
+    score = torch.tensor([0.9, 0.8, 0.1, 0.7, 0.6, 0.5, 0.8], dtype=torch.float64)
+    edges = edges._replace(target_from_source=RigidMotion(edges.target_from_source.rotation, wrong), score=score)
+    torch.testing.assert_close(spanning_poses(edges, 6).matrix, world.matrix, rtol=0, atol=1e-12)
 
 
 def _room(scans: int, rays: int = 180) -> ScanSet:

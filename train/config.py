@@ -38,12 +38,14 @@ class EdgeConfig(Settings):
     loops_per_scan: most loop candidates of one scan, 0 for none.
     rounds: how often loop candidates are sought again from the corrected poses, 0 for no loops.
     points: most points of a scan that a registration reads.
+    refined_points: most points of a scan that the last refinement of all poses reads.
     """
 
     window: Count = 3
     loops_per_scan: Annotated[int, Field(ge=0)] = 4
     rounds: Annotated[int, Field(ge=0)] = 2
     points: Annotated[int, Field(ge=10)] = 1000
+    refined_points: Annotated[int, Field(ge=10)] = 5000
 
 
 class TrainingConfig(Settings):

@@ -13,6 +13,7 @@ from bbr_layer import atomic_write, write_cloud, write_poses_kitti, write_poses_
 from train.browser_map import write_browser_map
 from train.curves import losses_picture, trajectory_picture
 from train.drawing import HEIGHT_COLOURS, HEIGHT_QUANTILES, TIME_COLOURS, save_picture
+from train.moving_points import MovingPoints
 from train.occupancy_grid import OccupancyGrid, occupancy_grid
 from train.pictures import floor_plan, network_field, top_and_side_view
 from train.pose_graph import Edges
@@ -24,7 +25,7 @@ from train.scans import Progress, ScanSet, silent
 # Kind of edge that joins scans far apart in time.
 LOOP = 2
 # Written only where there is something to show; a run takes away those of an earlier one in the same folder.
-OPTIONAL = ("poses_kitti.txt", "losses.png", "occupancy_network.png")
+OPTIONAL = ("poses_kitti.txt", "losses.png", "occupancy_network.png", "movers.ply")
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class MapResult:
         return self.world_from_scan[:, :d, d]
 
     def world_points(self) -> Float[np.ndarray, "n d"]:
-        """The merged map: every point of every scan, in the world frame."""
+        """Every point of every scan, in the world frame."""
         d = self.scans.dimension
         placed = zip(self.scans.points, self.world_from_scan, strict=True)
         return np.concatenate([scan @ pose[:d, :d].T + pose[:d, d] for scan, pose in placed])
@@ -68,9 +69,11 @@ class MapResult:
 def write_outputs(out: str | Path, result: MapResult, progress: Progress = silent) -> dict[str, object]:
     """Write the run's files into the folder ``out``, made if it is missing; each file whole or not at all.
 
-    ``poses_tum.txt``, ``poses_kitti.txt`` (3D), ``poses.npz``; ``map.ply`` with the number of the scan of each
-    point; ``trajectory.png``, ``map.png``, ``losses.png``; ``occupancy.png`` with ``occupancy.yaml`` (map_server),
-    ``occupancy_network.png``; ``map.html``; ``metrics.json``; ``config.yaml``. Returns what ``metrics.json`` holds.
+    ``poses_tum.txt``, ``poses_kitti.txt`` (3D), ``poses.npz``; ``map.ply`` with, of each point, the number of its scan
+    and the share of other scans that saw through it; ``movers.ply``, the points that more scans saw through than found
+    and that therefore left the map; ``trajectory.png``, ``map.png``, ``losses.png``; ``occupancy.png`` with
+    ``occupancy.yaml`` (map_server), ``occupancy_network.png``; ``map.html``; ``metrics.json``; ``config.yaml``. Returns
+    what ``metrics.json`` holds.
 
     Raises
     ------
@@ -84,13 +87,18 @@ def write_outputs(out: str | Path, result: MapResult, progress: Progress = silen
     folder.mkdir(parents=True, exist_ok=True)
     for name in OPTIONAL:
         (folder / name).unlink(missing_ok=True)
-    points = result.world_points()
+    everything = result.world_points()
+    moving = MovingPoints(result.scans, result.edges, result.world_from_scan)
+    points = everything[~moving.moved]
     _write_poses(folder, result)
     write_yaml(folder / "config.yaml", result.settings)
     metrics = map_metrics(result.scans, result.world_from_scan, points, result.edges)
     metrics |= {"unit": result.unit, "timings": result.timings, "losses": result.losses}
+    metrics["moving_points"] = int(moving.moved.sum())
     write_json(folder / "metrics.json", metrics)
-    _write_map(folder / "map.ply", result, points)
+    _write_map(folder / "map.ply", result, everything, moving, ~moving.moved)
+    if moving.moved.any():
+        _write_map(folder / "movers.ply", result, everything, moving, moving.moved)
     grid = occupancy_grid(result.scans.points, result.world_from_scan, progress=progress)
     write_ros_map(folder / "occupancy.png", grid)
     pictures = _pictures(result, points, grid)
@@ -123,14 +131,15 @@ def _write_poses(folder: Path, result: MapResult) -> None:
         np.savez_compressed(temporary, **arrays)
 
 
-def _write_map(path: Path, result: MapResult, points: np.ndarray) -> None:
-    """The merged points with the number of their scan, coloured by height (3D) or by scan (2D)."""
+def _write_map(path: Path, result: MapResult, points: np.ndarray, moving: MovingPoints, kept: np.ndarray) -> None:
+    """The ``kept`` points with the number of their scan, coloured by height (3D) or by scan (2D)."""
     scan = np.repeat(np.arange(len(result.scans), dtype=np.int32), [len(one) for one in result.scans.points])
     values = points[:, 2] if result.scans.dimension == 3 else scan
     low, high = np.quantile(values, HEIGHT_QUANTILES) if result.scans.dimension == 3 else (0, len(result.scans) - 1)
     shades = HEIGHT_COLOURS if result.scans.dimension == 3 else TIME_COLOURS
     colours = shades(np.clip((values - low) / max(high - low, np.finfo(float).tiny), 0, 1), bytes=True)[:, :3]
-    write_cloud(path, points, columns={"scan": scan}, colours=colours)
+    columns = {"scan": scan[kept], "seen_through": moving.share[kept].astype(np.float32)}
+    write_cloud(path, points[kept], columns=columns, colours=colours[kept])
 
 
 def _pictures(result: MapResult, points: np.ndarray, grid: OccupancyGrid) -> dict[str, Callable[[], Figure]]:

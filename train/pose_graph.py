@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.sparse import bsr_array, csc_array
+from scipy.sparse import bsr_array, csc_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
@@ -64,17 +65,34 @@ class Edges(NamedTuple):
         return Edges(torch.cat((self.target, other.target)), torch.cat((self.source, other.source)), motion, *rest)
 
 
-def chained(edges: Edges, scans: int) -> RigidMotion:
-    """``world_from_scan`` by chaining the consecutive edges, the first scan at the origin, ``(scans, ...)``."""
+def spanning_poses(edges: Edges, scans: int) -> RigidMotion:
+    """``world_from_scan`` along the tree of the best edges, the first scan at the origin, ``(scans, ...)``.
+
+    Raises
+    ------
+    ValueError: the edges do not join all scans.
+    """
     d = edges.centre.shape[-1]
-    poses = [RigidMotion.identity(d)]
-    consecutive = edges.kept(edges.kind == 0)
-    order = torch.argsort(consecutive.source)
-    for edge in order.tolist():
-        poses.append(poses[-1] @ consecutive.target_from_source.item(edge))
-    if len(poses) != scans:
-        raise ValueError(f"{len(poses) - 1} consecutive edges were given; {scans} scans need {scans - 1}")
-    return RigidMotion(*(torch.stack(field) for field in zip(*poses, strict=True)))
+    numbers = (edges.target.numpy(), edges.source.numpy())
+    # Costs are positive, as a sparse 0 would be no edge; of two edges of one pair the best is left.
+    costs = 2.0 - edges.score.clamp(0, 1).numpy()
+    best = {
+        pair: edge for edge in np.argsort(-costs).tolist() for pair in [(int(numbers[0][edge]), int(numbers[1][edge]))]
+    }
+    kept = np.array(list(best.values()))
+    graph = csr_array((costs[kept], (numbers[0][kept], numbers[1][kept])), shape=(scans, scans))
+    order, before = breadth_first_order(minimum_spanning_tree(graph), 0, directed=False)
+    if len(order) != scans:
+        raise ValueError(f"{len(kept)} edges join {len(order)} scans to the first; there are {scans} to be joined")
+    poses = {0: RigidMotion.identity(d)}
+    for scan in order[1:].tolist():
+        last = int(before[scan])
+        forth = best.get((last, scan))
+        motion = edges.target_from_source
+        poses[scan] = poses[last] @ (
+            motion.item(forth) if forth is not None else motion.item(best[scan, last]).inverse()
+        )
+    return RigidMotion(*(torch.stack(field) for field in zip(*(poses[scan] for scan in range(scans)), strict=True)))
 
 
 def solve_pose_graph(edges: Edges, start: RigidMotion) -> tuple[RigidMotion, Tensor]:

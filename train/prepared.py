@@ -30,6 +30,20 @@ def prepare(scans: ScanSet, most: int) -> Prepared:
         kept = torch.from_numpy(_thinned(scan, most))
         chosen.append(points[kept])
         normals.append(estimate_normals(points, neighbours)[kept])
+    return _padded(chosen, normals)
+
+
+def thinned(prepared: Prepared, most: int) -> Prepared:
+    """At most ``most`` of the points of each scan, even in space."""
+    chosen, normals = [], []
+    for points, directions, mask in zip(*prepared, strict=True):
+        kept = torch.from_numpy(_thinned(points[mask].double().numpy(), most))
+        chosen.append(points[mask][kept])
+        normals.append(directions[mask][kept])
+    return _padded(chosen, normals)
+
+
+def _padded(chosen: list[Tensor], normals: list[Tensor]) -> Prepared:
     sizes = torch.tensor([len(points) for points in chosen])
     points, directions = (torch.nn.utils.rnn.pad_sequence(x, batch_first=True).float() for x in (chosen, normals))
     return Prepared(points, directions, torch.arange(int(sizes.max())) < sizes[:, None])

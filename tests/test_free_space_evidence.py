@@ -1,0 +1,66 @@
+"""What contradicts other scans is told from what stands still; and it leaves the map."""
+
+import numpy as np
+import torch
+from small_worlds import true_edges
+
+from bbr_layer import read_cloud
+from train.moving_points import MovingPoints
+from train.outputs import MapResult, write_outputs
+from train.scans import ScanSet
+
+WALL, RAYS, SCANS = 2.0, 360, 6
+ANGLES = np.linspace(0, 2 * np.pi, RAYS, endpoint=False) + 1e-3
+
+
+def _hall(walks: bool) -> tuple[ScanSet, np.ndarray]:
+    """A square hall from six places; a column of radius 0.2 stands in it or walks through it. Which points are its."""
+    rays = np.stack((np.cos(ANGLES), np.sin(ANGLES)), axis=1)
+    points, labels, poses = [], [], []
+    for scan in range(SCANS):
+        sensor = np.array([-1.0 + 0.1 * scan, -0.5])
+        column = np.array([0.5, -0.8 + 0.5 * scan if walks else 0.4]) - sensor
+        far = np.min((np.sign(rays) * WALL - sensor) / rays, axis=1)
+        along = rays @ column
+        room = along**2 - (column**2).sum() + 0.04
+        met = np.where((room > 0) & (along > 0), along - np.sqrt(np.maximum(room, 0)), np.inf)
+        points.append(rays * np.minimum(met, far)[:, None])
+        labels.append(met < far)
+        poses.append(np.array([[1, 0, sensor[0]], [0, 1, sensor[1]], [0, 0, 1.0]]))
+    truth = np.linalg.inv(poses[0]) @ np.stack(poses)
+    names = [str(number) for number in range(SCANS)]
+    return ScanSet(points, names, np.arange(SCANS, dtype=float), truth=truth), np.concatenate(labels)
+
+
+def test_a_walking_column_has_moved_and_the_walls_have_not():
+    scans, column = _hall(walks=True)
+    moving = MovingPoints(scans, true_edges(scans), scans.truth)
+    assert moving.moved[column].mean() > 0.9
+    assert moving.moved[~column].mean() < 0.02
+    assert moving.share[column].mean() > 0.8 > 0.1 > moving.share[~column].mean()
+
+
+def test_a_standing_column_has_not_moved():
+    scans, column = _hall(walks=False)
+    moving = MovingPoints(scans, true_edges(scans), scans.truth)
+    assert column.sum() > 50 and moving.moved.mean() < 0.02
+
+
+def test_without_edges_nobody_bears_witness():
+    scans, _ = _hall(walks=True)
+    assert not MovingPoints(scans, None, scans.truth).moved.any()
+
+
+def test_what_moved_leaves_the_map(tmp_path, monkeypatch):
+    monkeypatch.setattr("train.outputs._pictures", lambda *told: {})
+    monkeypatch.setattr("train.outputs.write_browser_map", lambda *told, names: None)
+    scans, column = _hall(walks=True)
+    edges = true_edges(scans)
+    metrics = write_outputs(tmp_path, MapResult(scans, scans.truth, edges))
+    still, moved = read_cloud(tmp_path / "map.ply"), read_cloud(tmp_path / "movers.ply")
+    assert len(still.points) + len(moved.points) == len(column)
+    assert len(moved.points) == metrics["moving_points"] > 0.9 * column.sum()
+    write_outputs(
+        tmp_path, MapResult(_hall(walks=False)[0], scans.truth, edges._replace(score=torch.zeros(len(edges.score))))
+    )
+    assert not (tmp_path / "movers.ply").exists()

@@ -1,0 +1,69 @@
+"""All poses at once: exact where the scans are, in any unit; points without weight do not pull."""
+
+import numpy as np
+import pytest
+import torch
+
+from bbr_layer import RigidMotion
+from train.prepared import prepare
+from train.refinement import refine
+from train.scans import ScanSet
+from train.surfaces import surfaces
+
+SCANS, SIDES = 5, np.array([4.0, 3.0, 2.5])
+EDGES = np.array([(i, j) for i in range(SCANS) for j in range(i + 1, SCANS)])
+
+
+def _box(d, unit=1.0):
+    """Scans of the walls of a box, each at points of its own, from places along it; and where they were."""
+    random, k = np.random.default_rng(0), d * (d - 1) // 2
+    turns = torch.tensor(random.uniform(-0.3, 0.3, size=(SCANS, k)))
+    places = torch.tensor(unit * random.uniform(1, 2, size=(SCANS, d)))
+    poses = RigidMotion.from_rotvec(turns, places)
+    clouds = []
+    for scan in range(SCANS):
+        points = random.uniform(0, 1, size=(250 * d, d))
+        axis = np.arange(len(points)) % d
+        points[np.arange(len(points)), axis] = points[np.arange(len(points)), axis] > 0.5
+        world = torch.from_numpy(unit * SIDES[:d] * points)
+        clouds.append(poses.item(scan).inverse()(world).numpy())
+    scans = ScanSet(clouds, [str(i) for i in range(SCANS)], np.arange(SCANS, dtype=float))
+    return surfaces(prepare(scans, 1000)), poses.matrix.numpy()
+
+
+def _shaken(poses, metres):
+    shaken = poses.copy()
+    shaken[1:, :-1, -1] += metres * np.random.default_rng(1).normal(size=shaken[1:, :-1, -1].shape)
+    return shaken
+
+
+def _alike(scans):
+    return np.ones(len(EDGES)), [np.ones(len(scan.points)) for scan in scans]
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_displaced_poses_come_back(d):
+    scans, truth = _box(d)
+    start = _shaken(truth, 0.03)
+    found = refine(scans, EDGES, start, _alike(scans))
+    assert np.array_equal(found[0], truth[0])
+    assert np.abs(found - truth).max() < 2e-3 < 0.02 < np.abs(start - truth).max()
+
+
+def test_the_same_in_any_unit():
+    (small, truth), (large, scaled) = _box(2), _box(2, unit=1000.0)
+    one = refine(small, EDGES, _shaken(truth, 0.03), _alike(small))
+    other = refine(large, EDGES, _shaken(scaled, 30.0), _alike(large))
+    np.testing.assert_allclose(other[:, :2, 2] / 1000, one[:, :2, 2], atol=1e-5)
+
+
+def test_a_wrong_edge_without_trust_and_points_without_weight_do_not_pull():
+    scans, truth = _box(2)
+    start = _shaken(truth, 0.03)
+    trust, of_points = _alike(scans)
+    of_points[4][:] = 0
+    found = refine(scans, EDGES, start, (trust, of_points))
+    assert np.array_equal(found[4], start[4]) and np.abs(found[:4] - truth[:4]).max() < 2e-3
+    trust[EDGES[:, 1] == 4] = 0
+    again = refine(scans, EDGES, start, (trust, _alike(scans)[1]))
+    np.testing.assert_allclose(again, found, atol=1e-6)
