@@ -13,9 +13,9 @@ from train.shape_features import matched
 
 # Pairs registered as one batch, and between two reports of progress.
 BATCH = 32
-# F's steps by kind of edge, and its first rate, twice the layer's own: neighbours start from afar, the others from
-# poses that are nearly right, and the refinement gives the accuracy (benchmarks/mapping_table.md).
-EDGE_STEPS, EDGE_RATE = {0: 200, 1: 100, 2: 100}, 0.01
+# F's steps and first rate, twice the layer's own. With half as many for window and loops the narrow view of
+# benchmarks/mapping_table.md ends 3.3 px off instead of below 1.
+EDGE_STEPS, EDGE_RATE = 200, 0.01
 # Points of a scan that soft buddies, whose cost grows with their square, are given.
 SOFT_POINTS = 400
 # Matches of features that are asked for a common motion, within this many spacings, and motions tried.
@@ -43,7 +43,7 @@ def register_pairs(
     """
     target, source = pairs
     prepared = scene.prepared
-    layer = BBRLayer("F", inner=Adam(EDGE_STEPS[kind], EDGE_RATE), backward=Detached())
+    layer = BBRLayer("F", inner=Adam(EDGE_STEPS, EDGE_RATE), backward=Detached())
     results = []
     for begin in range(0, len(target), BATCH):
         progress(STAGE_NAMES[kind], begin, len(target))
