@@ -1,6 +1,7 @@
 """Nearest neighbours of slowly moving points: those that cannot have changed are not looked up again."""
 
 import importlib.util
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -92,19 +93,23 @@ class MutualMargins:
     ----------
     P, Q: trees over the two clouds.
     kept: False looks everything up at every asking.
+
+    Attributes
+    ----------
+    small: whether compiled code searches on its own, without a tree.
     """
 
     def __init__(self, P: Tree, Q: Tree, kept: bool):
         self.forth = Margins(P, in_space(Q.points), kept)
         self.back = Margins(Q, in_space(P.points), kept)
-        self.small = max(len(P.points), len(Q.points)) <= SMALL
+        self.small = COMPILED and kept and max(len(P.points), len(Q.points)) <= SMALL
 
     def __call__(self, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
         """For each point of Q the nearest of P with Q carried by ``pose``, and whether the choice is mutual.
 
         The first is valid until the next call. P, carried back, is looked up in Q, and of it only the chosen points.
         """
-        if COMPILED and self.small and self.forth.kept:
+        if self.small:
             return self._compiled(pose)
         index = self.forth.nearest(pose)
         back = pose[0].T.copy(), -pose[0].T @ pose[1]
@@ -121,11 +126,15 @@ class MutualMargins:
         from bbr_layer.kernels import cpu_walk
 
         mutual, counts = cpu_walk.mutual_pairs(self.forth.tables(), self.back.tables(), pose)
-        for side, (asked, searched, looked_up) in zip((self.forth, self.back), counts, strict=True):
-            side.asked += asked
-            side.searched += searched
-            side.looked_up += looked_up
+        self.count(counts)
         return self.forth.index, mutual
+
+    def count(self, counts: Sequence[Sequence[int]]) -> None:
+        """Add to what each side was asked, searched for and looked up."""
+        for side, (asked, searched, looked_up) in zip((self.forth, self.back), counts, strict=True):
+            side.asked += int(asked)
+            side.searched += int(searched)
+            side.looked_up += int(looked_up)
 
 
 def _moved(pose: Pose, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:

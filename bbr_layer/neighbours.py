@@ -100,6 +100,22 @@ class MutualNeighbours:
         nearest[Q_rows], mutual[Q_rows] = index, both
         return nearest, mutual
 
+    def tables(self, number: int) -> tuple | None:
+        """What compiled code searches an item with: both sides, and the rows of P and Q; None where it cannot."""
+        item = self.items[number]
+        if not isinstance(item, MutualMargins) or not item.small:
+            return None
+        sizes = len(item.back.moving), len(item.forth.moving)
+        rows = (self.P_rows[number], self.Q_rows[number])
+        real = [np.arange(n) if kept is None else kept for n, kept in zip(sizes, rows, strict=True)]
+        return item.forth.tables(), item.back.tables(), *real
+
+    def count(self, number: int, counts: np.ndarray) -> None:
+        """Note what compiled code asked of an item, ``(2, 3)``."""
+        item = self.items[number]
+        if isinstance(item, MutualMargins):
+            item.count(counts.tolist())
+
     def _tiled(self, number: int, motion: RigidMotion) -> tuple[Tensor, Tensor]:
         item, P_rows, Q_rows = self.items[number], self.P_rows[number], self.Q_rows[number]
         nearest = torch.zeros(self.shape[1], dtype=torch.int64, device=self.device)

@@ -31,7 +31,7 @@ ORDER = {
         kernels.cpu_sweeps kernels.cpu_forces kernels.cpu_dual kernels.cpu_dual_forces kernels.gpu_forces
         kernels.cpu_dual_planes kernels.gpu
         kernels.cpu_items
-        kernels.cpu_batch kernels.cpu_course
+        kernels.cpu_batch kernels.cpu_course kernels.cpu_matched_course
         kernels.cpu
         kernels.choice
         kernels.soft

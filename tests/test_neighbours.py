@@ -83,6 +83,7 @@ def taken(monkeypatch) -> list[RigidMotion]:
         return answer(self, number, pose)
 
     monkeypatch.setattr(MutualNeighbours, "of_item", spy)
+    monkeypatch.setattr(MutualNeighbours, "tables", lambda self, number: None)  # or compiled code asks unseen
     return asked
 
 
@@ -103,6 +104,21 @@ def test_pairs_of_a_registration_are_those_of_brute_force_at_every_step(d, taken
     assert len(motions) >= 40
     search = assert_brute_force((P, Q, None, None), motions)
     assert search.looked_up < search.asked
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_compiled_steps_are_those_that_ask_for_their_pairs_one_by_one(d, monkeypatch):
+    cloud = torch.rand(2, 60, d, dtype=torch.float64)
+    given = {"P_mask": torch.rand(2, 60) < 0.8, "Q_mask": torch.rand(2, 60) < 0.8}
+    answers = []
+    for whole in (True, False):
+        if not whole:
+            monkeypatch.setattr(MutualNeighbours, "tables", lambda self, number: None)
+        P = cloud.clone().requires_grad_()
+        found = BBRLayer("F", inner=Adam(20, 0.02))(P, motion(d, 0.1).inverse()(cloud), **given).target_from_source
+        answers.append((found.matrix, *torch.autograd.grad(found.matrix.square().sum(), P)))
+    for one, other in zip(*answers, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
 
 
 def test_pairs_of_real_scans_are_those_of_brute_force_at_every_step(real_data, taken):

@@ -1,8 +1,9 @@
-"""F on its mutual pairs, compiled but for the search, and walked on; formulas as in ``kernels/matched.py``."""
+"""F on its mutual pairs, compiled, of large clouds but for the search; formulas as in ``kernels/matched.py``."""
 
 import numpy as np
 from torch import Tensor
 
+from bbr_layer.kernels import cpu_matched_course
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
 from bbr_layer.kernels.cpu_course import Adjoint
 from bbr_layer.kernels.cpu_matched import add_adjoint, add_weights, matched_clouds, slope_of
@@ -26,7 +27,10 @@ class MatchedScene:
 
     def walk(self, number: int, course: Course, trace: Trace) -> None:
         """Take item ``number`` along all steps of the course."""
-        clouds = self.clouds[number]
+        clouds, tables = self.clouds[number], self.search.tables(number)
+        if tables is not None:
+            self.search.count(number, cpu_matched_course.walk(clouds, tables, course, trace))
+            return
         for step, temperature in enumerate(course.temperatures):
             pose = trace.rotations[step], trace.translations[step]
             trace.gradients[step] = slope_of(clouds, self.search.of_item(number, pose), pose, temperature)
@@ -41,7 +45,11 @@ class MatchedScene:
         by_course: tuple[np.ndarray, np.ndarray],
     ) -> None:
         """Take the cotangents of its last point back to the first; ``by_course`` gets the temperatures' and rates'."""
-        clouds, (back, adjoint) = self.clouds[number], out
+        clouds, tables, (back, adjoint) = self.clouds[number], self.search.tables(number), out
+        if tables is not None:
+            whole = back, adjoint, *by_course
+            self.search.count(number, cpu_matched_course.walk_back(clouds, tables, course, trace, whole))
+            return
         by_clouds = adjoint.P, adjoint.Q, adjoint.P_normals, adjoint.Q_normals
         for step in reversed(range(len(course.temperatures))):
             along = retreat(course, trace, step, back, by_course[1])
