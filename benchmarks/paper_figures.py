@@ -12,9 +12,9 @@ from benchmarks.paper_methods import METHODS, Method
 from benchmarks.paper_results import Bench, Scores
 from train.drawing import ACCENT, INK, PAPER, QUIET, SECOND, new_figure, quiet_frame, save_picture
 
-OURS = {"BBRLayer()": INK, "BBRLayer.robust()": ACCENT}
+OURS = {"BBRLayer()": (INK, 3.4), "BBRLayer.robust()": (ACCENT, 1.5)}  # colour and width: the second lies on the first
 VARIANTS = dict(zip(("softBBS", "softBD", "N", "F"), ("#c9a227", "#b9770e", "#7d5a9b", SECOND), strict=True))
-PEERS = ("#2a9d8f", "#8ab17d", "#457b9d", "#9c89b8", "#b56576", "#6c757d", "#4a6fa5")
+PEERS = ("#2a9d8f", "#8ab17d", "#457b9d", "#9c89b8", "#b56576", "#6c757d", "#d18f5b")
 MARKERS = "os^vDPX"
 FLOOR_DEG = 0.01  # the lowest error drawn: an error of 0 has no place on a logarithmic axis
 COLOURS = 48  # of a picture
@@ -119,7 +119,8 @@ def _style(method: Method) -> dict[str, object]:
     if method.kind == "variant":
         return {"color": VARIANTS[method.name.removeprefix("paper ")], "ls": "--", "lw": 1.2, "label": method.name}
     if method.kind == "ours":
-        return {"color": OURS.get(method.name, INK), "lw": 2.2, "label": method.name, "zorder": 5}
+        colour, width = OURS.get(method.name, (QUIET, 1.5))
+        return {"color": colour, "lw": width, "label": method.name, "zorder": 5}
     number = [x.name for x in METHODS if x.kind == "peer"].index(method.name)
     marks = {"marker": MARKERS[number], "ms": 3.5, "mec": PAPER, "mew": 0.4}
     return {"color": PEERS[number], "lw": 0.9, "label": method.name, **marks}

@@ -9,7 +9,7 @@ from bbr_layer import atomic_write
 from benchmarks.lidar import processor
 from benchmarks.paper_experiments import LIDAR_POINTS
 from benchmarks.paper_losses import where_we_lose
-from benchmarks.paper_methods import METHODS, ROBUST_POINTS, SOFT_POINTS, Method
+from benchmarks.paper_methods import FEATURE_POINTS, METHODS, ROBUST_POINTS, SOFT_POINTS, Method
 from benchmarks.paper_results import CHOOSING, Bench, Scores
 
 HEAD = """# The paper's experiments, beside today's peers
@@ -31,11 +31,12 @@ what the paper leaves open.
   `BBRLayer.paper(...)`, take seconds to minutes each and have {variants} (N {slow}), shared sampling only, at most 500
   points. That few repeats tell a basin, not a percentage.
 - **Ours**: `BBRLayer()` and `BBRLayer.robust()` without any argument. On lidar they are thinned to {soft} and {robust}
-  points, as they look at every pair; `BBRLayer("F")`, the last stage alone, and the peers get {all} as in the paper.
-- **Peers** run at the better of two settings, chosen for each experiment and sampling on {chosen} other seeds per cell:
-  fewest failures, then lowest error. They begin where our layer begins: in place or centroid on centroid, whichever
-  lies better. Their unit is the point spacing. GICP and VGICP find their own normals, as in the paper. FPFH + RANSAC
-  ends with the narrow run of Open3D's symmetric ICP.
+  points, as they look at every pair; `BBRLayer("F")`, the last stage alone, and the peers get {all} as in the paper,
+  FPFH + RANSAC {features}.
+- **Peers** run at the better of two settings, chosen for each experiment and sampling on {chosen} other seeds per cell
+  (lidar: half as many): fewest failures, then lowest error. They begin where our layer begins: in place or centroid on
+  centroid, whichever lies better. Their unit is the point spacing. GICP and VGICP find their own normals, as in the
+  paper. FPFH + RANSAC ends with the narrow run of Open3D's symmetric ICP.
 """
 MISSING = "-"
 
@@ -49,11 +50,12 @@ def document(benches: list[Bench], path: Path) -> None:
         twice=2 * first.repeats,
         half=first.repeats // 2,
         all=LIDAR_POINTS,
+        features=FEATURE_POINTS,
         variants=first.variant_repeats,
         slow=len(first.seeds(slow)),
         soft=SOFT_POINTS,
         robust=ROBUST_POINTS,
-        chosen=len(CHOOSING),
+        chosen=CHOOSING,
     )
     parts = [head, *where_we_lose(benches)]
     names = dict.fromkeys(bench.experiment.name for bench in benches)
