@@ -18,7 +18,8 @@ def where_we_lose(benches: list[Bench]) -> Iterator[str]:
     yield from ("## Where we lose", "")
     yield (
         'Counted from the tables below: `BBRLayer()` (on lidar `BBRLayer("F")`) against the best peer of each cell by '
-        "median error, and `BBRLayer.robust()` against the peer with the fewest failures."
+        "median error, unless that is a failure too, and `BBRLayer.robust()` against the peer with the fewest failures. "
+        "Seconds vary by a third with what else the machine has to do."
     )
     yield ""
     for bench in benches:
@@ -38,7 +39,8 @@ def _of(bench: Bench) -> list[str]:
             continue
         level += 1
         best = min(peers, key=lambda x: float(np.median(peers[x].degrees)))
-        if np.median(peers[best].degrees) < np.median(own.degrees):
+        lowest = float(np.median(peers[best].degrees))
+        if lowest < min(float(np.median(own.degrees)), bench.experiment.failed_deg):
             worse.append(f"{cell} ({best} {_median(peers[best])} against {_median(own)})")
         surest = min(peers, key=lambda x: peers[x].failed(bench.experiment))
         if peers[surest].failed(bench.experiment) < safe.failed(bench.experiment):
