@@ -18,8 +18,8 @@ def where_we_lose(benches: list[Bench]) -> Iterator[str]:
     yield from ("## Where we lose", "")
     yield (
         'Counted from the tables below: `BBRLayer()` (on lidar `BBRLayer("F")`) against the best peer of each cell by '
-        "median error, unless that is a failure too, and `BBRLayer.robust()` against the peer with the fewest failures. "
-        "Seconds vary by a third with what else the machine has to do."
+        "median error, unless that is a failure too; `BBRLayer.robust()` against the peer with the fewest failures. "
+        "The machine had other work to do meanwhile, so that seconds are worth more within a table than across tables."
     )
     yield ""
     for bench in benches:
