@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from PIL import Image
 
 from bbr_layer import atomic_write
@@ -54,7 +55,7 @@ def _turns(benches: list[Bench]) -> Figure:
                 accurate.plot(x, [np.median(g) if len(g) else np.nan for g in good], **_style(method))
             failed.set_title(f"{panel}, {bench.sampling}", fontsize=9, color=INK)
             failed.set_ylim(-0.03, 1.03)
-            accurate.set_yscale("log")
+            _logarithmic(accurate)
             accurate.set_xlabel(bench.experiment.axis)
             if column == 0:
                 failed.set_ylabel("share that failed")
@@ -65,20 +66,32 @@ def _turns(benches: list[Bench]) -> Figure:
 def _accuracy(benches: list[Bench]) -> Figure:
     """Figs. 3 to 5: median rotation and translation errors against the number of points."""
     panels = list(dict.fromkeys(cell.panel for cell in benches[0].known_cells()))
-    columns = [(bench, panel) for bench in benches for panel in panels]
-    figure, grid = _grid(2, len(columns))
-    for column, (bench, panel) in enumerate(columns):
-        for method in METHODS:
-            x, found = _series(bench, method, panel)
-            grid[0, column].plot(x, [max(np.median(s.degrees), FLOOR_DEG) for s in found], **_style(method))
-            grid[1, column].plot(x, [1000 * np.median(s.shifts) for s in found], **_style(method))
-        grid[0, column].set_title(f"{panel}, {bench.sampling}", fontsize=9, color=INK)
-        grid[1, column].set_xlabel(bench.experiment.axis)
-        for axes in grid[:, column]:
-            axes.set_yscale("log")
-    grid[0, 0].set_ylabel("median error (deg)")
-    grid[1, 0].set_ylabel("median error (mm)")
+    beside = len(panels) == 1  # one object: the samplings stand side by side, else one below the other
+    figure, grid = _grid(2 if beside else 2 * len(benches), len(benches) if beside else len(panels))
+    for number, bench in enumerate(benches):
+        for place, panel in enumerate(panels):
+            row, column = (0, number) if beside else (2 * number, place)
+            turned, shifted = grid[row, column], grid[row + 1, column]
+            for method in METHODS:
+                x, found = _series(bench, method, panel)
+                turned.plot(x, [max(np.median(s.degrees), FLOOR_DEG) for s in found], **_style(method))
+                shifted.plot(x, [1000 * np.median(s.shifts) for s in found], **_style(method))
+            turned.set_title(f"{panel}, {bench.sampling}", fontsize=9, color=INK)
+            shifted.set_xlabel(bench.experiment.axis)
+            _logarithmic(turned)
+            _logarithmic(shifted)
+            if column == 0:
+                turned.set_ylabel("median error (deg)")
+                shifted.set_ylabel("median error (mm)")
     return _named(figure, grid)
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic axis with plain numbers, and not only powers of ten."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.yaxis.set_minor_locator(NullLocator())
 
 
 def _cumulative(benches: list[Bench]) -> Figure:
@@ -91,6 +104,7 @@ def _cumulative(benches: list[Bench]) -> Figure:
                 share = (found.degrees[:, None] <= THRESHOLDS_DEG).mean(0)
                 axes.plot(THRESHOLDS_DEG, share, **_style(method) | {"marker": ""})
         axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
         axes.set_ylim(-0.02, 1.02)
         axes.axvline(bench.experiment.failed_deg, color=QUIET, lw=0.6, ls=":")
         axes.set_title(f"{cell.panel}, {bench.sampling}", fontsize=9, color=INK)

@@ -31,7 +31,7 @@ def _of(bench: Bench) -> list[str]:
     cells = [cell.name for cell in bench.known_cells()]
     lidar = bench.experiment.name == "lidar"
     ours, sure = (LIDAR, LIDAR) if lidar else (ACCURATE, SURE)
-    worse, failing, level = [], [], 0
+    worse, failing, farther, level = [], [], 0, 0
     for cell in cells:
         own, safe = bench.scores(ours, cell), bench.scores(sure, cell)
         peers = {x.name: found for x in PEERS if (found := bench.scores(x, cell)) is not None}
@@ -42,6 +42,8 @@ def _of(bench: Bench) -> list[str]:
         lowest = float(np.median(peers[best].degrees))
         if lowest < min(float(np.median(own.degrees)), bench.experiment.failed_deg):
             worse.append(f"{cell} ({best} {_median(peers[best])} against {_median(own)})")
+        nearest = min(float(np.median(x.shifts)) for x in peers.values())
+        farther += nearest < np.median(own.shifts)
         surest = min(peers, key=lambda x: peers[x].failed(bench.experiment))
         if peers[surest].failed(bench.experiment) < safe.failed(bench.experiment):
             fewer = f"{peers[surest].failed(bench.experiment)} against {safe.failed(bench.experiment)}"
@@ -49,6 +51,7 @@ def _of(bench: Bench) -> list[str]:
     if not level:
         return []
     lines = [_sentence("A peer's median is lower", worse, level), _sentence("A peer fails less", failing, level)]
+    lines += [f"A peer's median translation is lower in {farther}."]
     return [*lines, _faster(bench, cells[-1], ours)]
 
 
