@@ -30,6 +30,10 @@ DISTRACTORS, DISTRACTOR = (200, 500, 900), Distractor(0.5, 1.0, 20.0, 0.02)
 LIDAR_PAIRS = ("pair_kitti00_95_94", "pair_libpointmatcher_car401_400", "formats")
 LIDAR_POINTS = 30_000  # of each scan, as in the paper (4.5)
 KINECT_FRAMES = (0, 4)  # of the sequence: the two farthest apart
+KINECT_NOTE = (
+    "The paper's own pair (freiburg1_xyz) is not at hand: these are two frames of freiburg1_desk. All methods stop at much "
+    "the same distance from the motion capture's answer: it, not they, seems to be the limit here."
+)
 
 
 class Cell(NamedTuple):
@@ -55,6 +59,7 @@ class Experiment(NamedTuple):
     repeats: float = 1.0  # times the repeats asked for
     failed_deg: float = 5.0  # paper, 4.2
     failed_shift: float = float("inf")
+    note: str = ""  # what a reader of the results has to know
 
 
 def surface(name: str) -> Surface:
@@ -123,7 +128,9 @@ EXPERIMENTS = (
     Experiment("fig3", "Fig. 3: accuracy on whole models", "points M", _fig3),
     Experiment("fig4", "Fig. 4: partial overlap, bun000 and bun090, 5 deg", "points M", _fig4),
     Experiment("fig5", "Fig. 5: a distractor beside 1000 points", "points of the distractor", _fig5),
-    Experiment("fig6", "Fig. 6: two Kinect frames, M = 1000, up to 5 deg", "points M", _fig6, repeats=2.0),
+    Experiment(
+        "fig6", "Fig. 6: two Kinect frames, M = 1000, up to 5 deg", "points M", _fig6, repeats=2.0, note=KINECT_NOTE
+    ),
     Experiment("fig7", "Fig. 7: bun180 and bun270, M = 1000, 30 to 50 deg", "points M", _fig7, repeats=2.0),
     Experiment("lidar", "Tables 1 and 2: lidar, up to 1 m and 1 deg off", "m, deg", _lidar, 0.5, 1.0, 0.5),
 )

@@ -18,9 +18,10 @@ VARIANTS = dict(zip(("softBBS", "softBD", "N", "F"), ("#c9a227", "#b9770e", "#7d
 PEERS = ("#2a9d8f", "#8ab17d", "#457b9d", "#9c89b8", "#b56576", "#6c757d", "#d18f5b")
 MARKERS = "os^vDPX"
 FLOOR_DEG = 0.01  # the lowest error drawn: an error of 0 has no place on a logarithmic axis
-COLOURS = 48  # of a picture
+COLOURS = 64  # of a picture
 PANEL = (2.6, 2.1)  # inches
-THRESHOLDS_DEG = np.geomspace(0.02, 180.0, 200)
+FARTHEST_DEG = 6.0  # cumulative curves are drawn at least so far: beyond what counts as failed
+THRESHOLDS = 300
 
 
 def draw(benches: list[Bench], folder: Path) -> None:
@@ -37,7 +38,9 @@ def _save(figure: Figure, path: Path) -> None:
     """As the mapper's pictures, in so few colours that the file stays small."""
     save_picture(figure, path)
     with Image.open(path) as image, atomic_write(path) as temporary:
-        image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(temporary, optimize=True)
+        image.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+            temporary, optimize=True
+        )
 
 
 def _turns(benches: list[Bench]) -> Figure:
@@ -99,12 +102,17 @@ def _cumulative(benches: list[Bench]) -> Figure:
     figure, grid = _grid(1, len(benches), scale=1.5)
     for axes, bench in zip(grid[0], benches, strict=True):
         (cell,) = bench.known_cells()
+        errors = {m.name: found.degrees for m in METHODS if (found := bench.scores(m, cell.name))}
+        everything = np.concatenate(list(errors.values()))
+        thresholds = np.geomspace(0.8 * everything.min(), max(1.2 * everything.max(), FARTHEST_DEG), THRESHOLDS)
         for method in METHODS:
-            if found := bench.scores(method, cell.name):
-                share = (found.degrees[:, None] <= THRESHOLDS_DEG).mean(0)
-                axes.plot(THRESHOLDS_DEG, share, **_style(method) | {"marker": ""})
+            if method.name in errors:
+                share = (errors[method.name][:, None] <= thresholds).mean(0)
+                axes.plot(thresholds, share, **_style(method) | {"marker": ""})
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.set_ylim(-0.02, 1.02)
         axes.axvline(bench.experiment.failed_deg, color=QUIET, lw=0.6, ls=":")
         axes.set_title(f"{cell.panel}, {bench.sampling}", fontsize=9, color=INK)

@@ -64,6 +64,7 @@ def document(benches: list[Bench], path: Path) -> None:
         parts += ["", f"## {alike[0].experiment.title}", ""]
         if name != "lidar" and any(x.known_cells() for x in alike):
             parts += [f"![{alike[0].experiment.title}](paper_{name}.png)"]
+        parts += ["", alike[0].experiment.note] if alike[0].experiment.note else []
         for bench in sorted(alike, key=lambda x: x.sampling, reverse=True):
             parts += _tables(bench)
     with atomic_write(path) as temporary:
