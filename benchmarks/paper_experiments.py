@@ -31,8 +31,8 @@ LIDAR_PAIRS = ("pair_kitti00_95_94", "pair_libpointmatcher_car401_400", "formats
 LIDAR_POINTS = 30_000  # of each scan, as in the paper (4.5)
 KINECT_FRAMES = (0, 4)  # of the sequence: the two farthest apart
 KINECT_NOTE = (
-    "The paper's own pair (freiburg1_xyz) is not at hand: these are two frames of freiburg1_desk. All methods stop at much "
-    "the same distance from the motion capture's answer: it, not they, seems to be the limit here."
+    "The paper's own pair (freiburg1_xyz) is not at hand: these are two frames of freiburg1_desk. All methods stop at "
+    "much the same distance from the motion capture's answer: it, not they, seems to be the limit here."
 )
 
 
