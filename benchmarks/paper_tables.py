@@ -11,6 +11,7 @@ from benchmarks.paper_experiments import LIDAR_POINTS
 from benchmarks.paper_losses import where_we_lose
 from benchmarks.paper_methods import FEATURE_POINTS, METHODS, ROBUST_POINTS, SOFT_POINTS, Method
 from benchmarks.paper_results import CHOOSING, Bench, Scores
+from benchmarks.paper_trials import LIDAR_UNIT
 
 HEAD = """# The paper's experiments, beside today's peers
 
@@ -35,7 +36,7 @@ what the paper leaves open.
   FPFH + RANSAC {features}.
 - **Peers** run at the better of two settings, chosen for each experiment and sampling on {chosen} other seeds per cell
   (lidar: half as many): fewest failures, then lowest error. They begin where our layer begins: in place or centroid on
-  centroid, whichever lies better. Their unit is the point spacing. GICP and VGICP find their own normals, as in the
+  centroid, whichever lies better. Their unit is the point spacing, on lidar {unit:g} m. GICP and VGICP find their own normals, as in the
   paper. FPFH + RANSAC ends with the narrow run of Open3D's symmetric ICP.
 """
 MISSING = "-"
@@ -56,6 +57,7 @@ def document(benches: list[Bench], path: Path) -> None:
         soft=SOFT_POINTS,
         robust=ROBUST_POINTS,
         chosen=CHOOSING,
+        unit=LIDAR_UNIT,
     )
     parts = [head, *where_we_lose(benches)]
     names = dict.fromkeys(bench.experiment.name for bench in benches)

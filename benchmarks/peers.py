@@ -37,7 +37,7 @@ class Clouds(NamedTuple):
 
 def in_spacings(trial: Trial) -> tuple[Clouds, np.ndarray, float]:
     """The clouds, and the centre and the unit to go back by."""
-    unit = float((point_spacing(trial.P) + point_spacing(trial.Q)) / 2)
+    unit = trial.unit or float((point_spacing(trial.P) + point_spacing(trial.Q)) / 2)
     normals = [
         (estimate_normals(x) if given is None else given).numpy()
         for x, given in ((trial.P, trial.P_normals), (trial.Q, trial.Q_normals))
