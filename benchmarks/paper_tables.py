@@ -36,8 +36,8 @@ what the paper leaves open.
   FPFH + RANSAC {features}.
 - **Peers** run at the better of two settings, chosen for each experiment and sampling on {chosen} other seeds per cell
   (lidar: half as many): fewest failures, then lowest error. They begin where our layer begins: in place or centroid on
-  centroid, whichever lies better. Their unit is the point spacing, on lidar {unit:g} m. GICP and VGICP find their own normals, as in the
-  paper. FPFH + RANSAC ends with the narrow run of Open3D's symmetric ICP.
+  centroid, whichever lies better. Their unit is the point spacing, on lidar {unit:g} m. GICP and VGICP find their own
+  normals, as in the paper. FPFH + RANSAC ends with the narrow run of Open3D's symmetric ICP.
 """
 MISSING = "-"
 
