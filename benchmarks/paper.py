@@ -1,75 +1,63 @@
-"""The paper's Fig. 2 on the Stanford bunny: failures and accuracy of the four variants against the initial rotation.
+"""The paper's experiments beside today's peers: tables and pictures of errors, failures and seconds.
 
-    python -m benchmarks.paper --repeats 3 --out benchmarks/paper_fig2.md
+    python -m benchmarks.paper --peers --repeats 20 --out docs
 
-Two random subsets of 500 points, one rotated about a random axis, normals of 13 neighbours in the full cloud shared by
-both, as in the paper; failure is an error over 5 degrees. The default layer stands beside the four variants.
+The whole takes about an hour. Every registration is kept in the results file as soon as its cell is done: a run that
+was cut off goes on where it was, and tables and pictures are drawn from what is there. ``--only fig3`` runs one
+experiment, ``--draw`` none. The peers want ``pip install '.[peers]'``.
 """
 
 import argparse
-import math
-import time
 from pathlib import Path
-from statistics import mean
 
 import torch
-from torch import Tensor
 
-from bbr_layer import BBRLayer, Detached, RigidMotion, angular_error, estimate_normals
-from benchmarks.data import model
-
-POINTS = 500
-FAILURE_DEG = 5.0
-PAPER_NEIGHBOURS = 13
-
-
-def trial(cloud: Tensor, normals: Tensor, layer: BBRLayer, degrees: float, seed: int) -> float:
-    """Angular error in degrees of one registration."""
-    generator = torch.Generator().manual_seed(seed)
-    first, second = (torch.randperm(len(cloud), generator=generator)[:POINTS] for _ in range(2))
-    axis = torch.randn(3, generator=generator, dtype=torch.float64)
-    truth = RigidMotion.from_rotvec(axis / axis.norm() * math.radians(degrees), torch.zeros(3, dtype=torch.float64))
-    result = layer(
-        truth(cloud[first]), cloud[second], P_normals=truth.rotate(normals[first]), Q_normals=normals[second]
-    )
-    return math.degrees(angular_error(result.target_from_source.rotation, truth.rotation).item())
+from benchmarks.paper_experiments import EXPERIMENTS
+from benchmarks.paper_figures import draw
+from benchmarks.paper_methods import METHODS
+from benchmarks.paper_results import Bench, Results
+from benchmarks.paper_tables import document
+from benchmarks.paper_trials import SAMPLINGS
+from benchmarks.peers import open3d
 
 
-def cell(cloud: Tensor, normals: Tensor, layer: BBRLayer, degrees: float, repeats: int) -> str:
-    """Failures, mean error of the successes, and CPU seconds per registration."""
-    before = time.process_time()
-    errors = [trial(cloud, normals, layer, degrees, seed) for seed in range(repeats)]
-    seconds = (time.process_time() - before) / repeats
-    successes = [e for e in errors if e <= FAILURE_DEG]
-    accuracy = f"{mean(successes):.3f}" if successes else "-"
-    return f"{len(errors) - len(successes)}/{repeats}, {accuracy}, {seconds:.1f} s"
+def options() -> argparse.Namespace:
+    """What was asked for."""
+    parser = argparse.ArgumentParser(description="the paper's experiments")
+    names = [x.name for x in EXPERIMENTS]
+    parser.add_argument("--only", nargs="+", choices=names, default=names, help="run these experiments alone")
+    parser.add_argument("--sampling", nargs="+", choices=SAMPLINGS, default=SAMPLINGS)
+    parser.add_argument("--peers", action="store_true", help="run the peers too")
+    parser.add_argument("--repeats", type=int, default=20, help="twice as many in Figs. 6 and 7, half for lidar")
+    parser.add_argument("--variant-repeats", type=int, default=3, help="of the paper's four variants, which are slow")
+    parser.add_argument("--draw", action="store_true", help="run nothing, only write what the results file holds")
+    parser.add_argument("--results", type=Path, default=Path("out/paper_results.json"))
+    parser.add_argument("--out", type=Path, default=Path("docs"))
+    return parser.parse_args()
 
 
 def main() -> None:
-    """Write the table to the file named."""
-    parser = argparse.ArgumentParser(description="Fig. 2 of the paper")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--angles", type=float, nargs="+", default=[10.0, 30.0, 60.0, 90.0])
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/paper_fig2.md"))
-    options = parser.parse_args()
+    """Run what is missing, then write the tables and pictures."""
+    asked = options()
     torch.set_num_threads(1)
-    cloud = model("bun_zipper")
-    cloud, normals = cloud.double(), estimate_normals(cloud, PAPER_NEIGHBOURS)
-    layers = {f"paper {name}": BBRLayer.paper(name, Detached()) for name in ("softBBS", "softBD", "N", "F")}
-    layers["BBRLayer()"] = BBRLayer(backward=Detached())
-    lines = [
-        f"Made by `python -m benchmarks.paper --repeats {options.repeats}`: Stanford bunny, {POINTS} points, shared "
-        "normals of the full cloud. Each cell: failures over 5 degrees / repeats, mean error of the successes in "
-        "degrees, CPU seconds per registration on one thread.",
-        "",
-        "| layer | " + " | ".join(f"{angle:g} deg" for angle in options.angles) + " |",
-        "|---|" + "---|" * len(options.angles),
+    asked.results.parent.mkdir(parents=True, exist_ok=True)
+    results = Results(asked.results)
+    benches = [
+        Bench(results, experiment, sampling, asked.repeats, asked.variant_repeats)
+        for sampling in reversed(SAMPLINGS)
+        for experiment in EXPERIMENTS
     ]
-    for name, layer in layers.items():
-        cells = [cell(cloud, normals, layer, angle, options.repeats) for angle in options.angles]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-        print(lines[-1], flush=True)
-        options.out.write_text("\n".join(lines) + "\n")
+    if asked.peers and not asked.draw:
+        open3d()  # before an hour's work, not after
+    for bench in [] if asked.draw else benches:
+        if bench.experiment.name in asked.only and bench.sampling in asked.sampling:
+            cells = bench.experiment.cells(bench.sampling)
+            for method in METHODS:
+                if method.kind == "ours" or (asked.peers if method.kind == "peer" else asked.variant_repeats):
+                    bench.run(method, cells)
+    for name in sorted({x.experiment.name for x in benches}):
+        draw([x for x in benches if x.experiment.name == name], asked.out)
+    document(benches, asked.out / "experiments.md")
 
 
 if __name__ == "__main__":
