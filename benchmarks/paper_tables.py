@@ -9,7 +9,7 @@ from bbr_layer import atomic_write
 from benchmarks.lidar import processor
 from benchmarks.paper_experiments import LIDAR_POINTS
 from benchmarks.paper_losses import where_we_lose
-from benchmarks.paper_methods import FEATURE_POINTS, METHODS, ROBUST_POINTS, SOFT_POINTS, Method
+from benchmarks.paper_methods import FEATURE_POINTS, METHODS, Method
 from benchmarks.paper_results import CHOOSING, Bench, Scores
 from benchmarks.paper_trials import LIDAR_UNIT
 
@@ -31,9 +31,8 @@ what the paper leaves open.
 - **Repeats**: {repeats} per cell, {twice} in Figs. 6 and 7, {half} per lidar pair. The paper's own variants,
   `BBRLayer.paper(...)`, take seconds to minutes each and have {variants} (N {slow}), shared sampling only, at most 500
   points. That few repeats tell a basin, not a percentage.
-- **Ours**: `BBRLayer()` and `BBRLayer.robust()` without any argument. On lidar they are thinned to {soft} and {robust}
-  points, as they look at every pair; `BBRLayer("F")`, the last stage alone, and the peers get {all} as in the paper,
-  FPFH + RANSAC {features}.
+- **Ours**: `BBRLayer()`, `BBRLayer.fast()` and `BBRLayer.robust()` without any argument; on lidar also `BBRLayer("F")`, the
+  paper's loss alone. Lidar scans are thinned to {all} points as in the paper, for FPFH + RANSAC to {features}.
 - **Peers** run at the better of two settings, chosen for each experiment and sampling on {chosen} other seeds per cell
   (lidar: half as many): fewest failures, then lowest error. They begin where our layer begins: in place or centroid on
   centroid, whichever lies better. Their unit is the point spacing, on lidar {unit:g} m. GICP and VGICP find their own
@@ -54,8 +53,6 @@ def document(benches: list[Bench], path: Path) -> None:
         features=FEATURE_POINTS,
         variants=first.variant_repeats,
         slow=len(first.seeds(slow)),
-        soft=SOFT_POINTS,
-        robust=ROBUST_POINTS,
         chosen=CHOOSING,
         unit=LIDAR_UNIT,
     )
