@@ -15,8 +15,9 @@ def where_we_lose(benches: list[Bench]) -> Iterator[str]:
     """A paragraph and a list: lower medians, fewer failures and fewer seconds of a peer."""
     yield from ("## Where we lose", "")
     yield (
-        "Counted from the tables below: `BBRLayer()` against the best peer of each cell by median error, unless that is a failure too; `BBRLayer.robust()` against the peer with the fewest failures. "
-        "The machine had other work to do meanwhile, so that seconds are worth more within a table than across tables."
+        "Counted from the tables below: `BBRLayer()` against the best peer of each cell by median error, unless that "
+        "is a failure too; `BBRLayer.robust()` against the peer with the fewest failures. The machine had other work "
+        "to do meanwhile, so that seconds are worth more within a table than across tables."
     )
     yield ""
     for bench in benches:
