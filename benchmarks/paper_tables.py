@@ -32,7 +32,8 @@ what the paper leaves open.
   `BBRLayer.paper(...)`, take seconds to minutes each and have {variants} (N {slow}), shared sampling only, at most 500
   points. That few repeats tell a basin, not a percentage.
 - **Ours**: `BBRLayer()`, `BBRLayer.fast()` and `BBRLayer.robust()` without any argument; on lidar also
-  `BBRLayer("F")`, the paper's loss alone. Lidar scans are thinned to {all} points as in the paper, for FPFH + RANSAC to {features}.
+  `BBRLayer("F")`, the paper's loss alone. Lidar scans are thinned to {all} points as in the paper, for FPFH + RANSAC
+  to {features}.
 - **Peers** run at the better of two settings, chosen for each experiment and sampling on {chosen} other seeds per cell
   (lidar: half as many): fewest failures, then lowest error. They begin where our layer begins: in place or centroid on
   centroid, whichever lies better. Their unit is the point spacing, on lidar {unit:g} m. GICP and VGICP find their own
