@@ -43,7 +43,9 @@ def named_stage(name: str, inner: Inner | None = None, temperature: Temperature 
     ValueError: another name.
     """
     if name not in _NAMED:
-        raise ValueError(f"there is no loss {name!r}; choose one of {', '.join(_NAMED)}")
+        raise ValueError(
+            f"there is no loss {name!r}; choose one of {', '.join(_NAMED)}, or BBRLayer.fast() or .robust()"
+        )
     loss, steps, rate, start, end = _NAMED[name]
     inner = Adam(steps, rate) if inner is None else inner
     return Stage(loss(), inner, Annealed(start, end) if temperature is None else temperature)

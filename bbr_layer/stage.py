@@ -15,9 +15,9 @@ from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.run import run
 from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.inner.unroll import Problem, cut_from_graph, value
-from bbr_layer.loss_base import Loss, Objective
+from bbr_layer.loss_base import Loss, Objective, SoftLoss
 from bbr_layer.pair import CloudPair, Frame, centre_and_radius
-from bbr_layer.temperature import Annealed, Temperature
+from bbr_layer.temperature import Annealed, Temperature, Unrounded
 from bbr_layer.thinning import thinned_pair
 
 # Rounding of soft distances at zero, in point spacings: the measured value at which the unrolled gradient of an exact
@@ -56,7 +56,8 @@ class Stage(nn.Module):
 
     Raises
     ------
-    ValueError: ``GaussNewton`` with a learned temperature or with Euler angles; hardly any ``points``.
+    ValueError: ``GaussNewton`` with a learned temperature or with Euler angles; hardly any ``points``; a soft loss with
+        ``Unrounded()``; another ``inner``.
     """
 
     def __init__(
@@ -70,8 +71,7 @@ class Stage(nn.Module):
         above: int = 0,
     ):
         super().__init__()
-        if points is not None and points < FEWEST_POINTS:
-            raise ValueError(f"points is {points}; a stage needs at least {FEWEST_POINTS} of each cloud: try 1000")
+        _check(loss, inner, temperature, points, above)
         self.loss = loss
         self.inner = Adam() if inner is None else inner
         self.temperature = Annealed() if temperature is None else temperature
@@ -129,6 +129,18 @@ class Stage(nn.Module):
         sizes = "" if self.points is None else f", points={self.points}"
         sizes += "" if not self.above else f", above={self.above}"
         return f"Stage({self.loss!r}, {self.inner!r}, {self.temperature!r}, {self.chart!r}{sizes})"
+
+
+def _check(loss: Loss, inner: object, temperature: object, points: object, above: object) -> None:
+    """Refuse settings of a stage that cannot work."""
+    if points is not None and not (isinstance(points, int) and points >= FEWEST_POINTS):
+        raise ValueError(f"points is {points}; a stage needs at least {FEWEST_POINTS} of each cloud: try 1000")
+    if not isinstance(above, int) or above < 0:
+        raise ValueError(f"above is {above}; it must be a whole number of points, not negative: try 10000")
+    if inner is not None and not isinstance(inner, Adam | GaussNewton):
+        raise ValueError(f"inner is {inner!r}; it must be Adam(...) or GaussNewton(...)")
+    if isinstance(temperature, Unrounded) and isinstance(loss, SoftLoss):
+        raise ValueError(f"temperature is Unrounded(), and {loss!r} divides by it: try Annealed()")
 
 
 @torch.no_grad()

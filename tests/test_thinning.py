@@ -5,7 +5,18 @@ import pytest
 import torch
 from problems import bumpy, motion
 
-from bbr_layer import Adam, BBRLayer, BuddyFilter, CloudPair, Detached, GaussNewton, SoftBBS, Stage, angular_error
+from bbr_layer import (
+    Adam,
+    BBRLayer,
+    BuddyFilter,
+    CloudPair,
+    Detached,
+    GaussNewton,
+    SoftBBS,
+    Stage,
+    Unrounded,
+    angular_error,
+)
 from bbr_layer.thinning import evenly_thinned, thinned_pair
 
 
@@ -62,7 +73,17 @@ def test_a_large_pair_goes_through_all_stages_and_a_small_one_leaves_the_last_ou
         assert angular_error(result.target_from_source.rotation, truth.rotation) < 0.02
 
 
-def test_hardly_any_points_or_no_first_stage_are_refused():
+def test_settings_of_a_stage_that_cannot_work_are_refused(as_a_user):
+    with pytest.raises(ValueError, match="points is many; a stage needs"):
+        Stage(BuddyFilter(), points="many")
+    with pytest.raises(ValueError, match="above is -1; it must be a whole number of points"):
+        Stage(BuddyFilter(), above=-1)
+    with pytest.raises(ValueError, match=r"inner is 'gn'; it must be Adam\(...\) or GaussNewton"):
+        BBRLayer("F", inner="gn")
+    with pytest.raises(ValueError, match=r"temperature is Unrounded\(\), and SoftBBS.* divides by it"):
+        Stage(SoftBBS(), temperature=Unrounded())
+    with pytest.raises(ValueError, match=r"no loss 'fast'; .* or BBRLayer.fast\(\)"):
+        BBRLayer("fast")
     with pytest.raises(ValueError, match="points is 3; a stage needs at least 4"):
         Stage(BuddyFilter(), points=3)
     with pytest.raises(ValueError, match="the first stage has above=10"):
