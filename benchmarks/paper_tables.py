@@ -29,8 +29,8 @@ what the paper leaves open.
   The lowest median of all but the paper's variants is bold. **s** is processor seconds per registration in the last
   column's trials, normals and trees included where the method makes them.
 - **Repeats**: {repeats} per cell, {twice} in Figs. 6 and 7, {half} per lidar pair. The paper's own variants,
-  `BBRLayer.paper(...)`, take seconds to minutes each and have {variants} (N {slow}), shared sampling only, at most 500
-  points. That few repeats tell a basin, not a percentage.
+  `BBRLayer.paper(...)`, take seconds to a minute each and have at most {variants} (N {slow}), in some places, shared
+  sampling only, at most 500 points. That few repeats tell a basin, not a percentage.
 - **Ours**: `BBRLayer()` and `BBRLayer.robust()` without any argument. On lidar they are thinned to {soft} and {robust}
   points, as they look at every pair; `BBRLayer("F")`, the last stage alone, and the peers get {all} as in the paper,
   FPFH + RANSAC {features}.
