@@ -132,5 +132,5 @@ EXPERIMENTS = (
         "fig6", "Fig. 6: two Kinect frames, M = 1000, up to 5 deg", "points M", _fig6, repeats=2.0, note=KINECT_NOTE
     ),
     Experiment("fig7", "Fig. 7: bun180 and bun270, M = 1000, 30 to 50 deg", "points M", _fig7, repeats=2.0),
-    Experiment("lidar", "Tables 1 and 2: lidar, up to 1 m and 1 deg off", "m, deg", _lidar, 0.5, 1.0, 0.5),
+    Experiment("lidar", "Tables 1 and 2: lidar, up to 1 m and 1 deg off", "m, deg", _lidar, 0.5, 1.0, 0.2),
 )

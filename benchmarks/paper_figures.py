@@ -18,8 +18,8 @@ VARIANTS = dict(zip(("softBBS", "softBD", "N", "F"), ("#c9a227", "#b9770e", "#7d
 PEERS = ("#2a9d8f", "#8ab17d", "#457b9d", "#9c89b8", "#b56576", "#6c757d", "#d18f5b")
 MARKERS = "os^vDPX"
 FLOOR_DEG = 0.01  # the lowest error drawn: an error of 0 has no place on a logarithmic axis
-COLOURS = 64  # of a picture
-PANEL = (2.6, 2.1)  # inches
+COLOURS = 48  # of a picture
+PANEL = (2.4, 1.85)  # inches
 FARTHEST_DEG = 6.0  # cumulative curves are drawn at least so far: beyond what counts as failed
 THRESHOLDS = 300
 

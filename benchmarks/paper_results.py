@@ -16,6 +16,9 @@ CHOOSING, CHOSEN_FROM = 4, 1000  # settings are chosen on so many seeds from thi
 TURNED_ROUND = 180.0  # degrees of error of an answer that is not finite
 
 
+SMALLEST = 1e-9  # degrees and data units: errors below are alike
+
+
 class Scores(NamedTuple):
     """The registrations of one method in one cell, in order of their seeds: arrays ``(k,)``."""
 
@@ -98,7 +101,7 @@ class Bench(NamedTuple):
         return sorted(found, key=lambda cell: (panels.index(cell.panel), cell.x))
 
     def chosen(self, method: Method) -> str:
-        """The setting that failed least on the seeds for choosing, over all cells, then was most accurate."""
+        """The setting that failed least on the seeds for choosing, over all cells, then had least turn times shift."""
         cells = [cell.name for cell in self.known_cells()]
 
         def rank(setting: str) -> tuple[int, float]:
@@ -108,8 +111,8 @@ class Bench(NamedTuple):
             known = [x for x in found if x is not None]
             if not known:
                 return 0, 0.0
-            logs = [float(np.log(max(np.median(x.degrees), 1e-6))) for x in known]
-            return sum(x.failed(self.experiment) for x in known), float(np.mean(logs))
+            errors = np.array([(np.median(x.degrees), np.median(x.shifts)) for x in known])
+            return sum(x.failed(self.experiment) for x in known), float(np.log(np.maximum(errors, SMALLEST)).mean())
 
         return min(method.settings, key=rank)
 

@@ -24,18 +24,18 @@ what the paper leaves open.
   estimates normals from the sample it gets. Two scans share no point either way; there *shared* means the full scans'
   normals.
 - **Errors.** Degrees between the rotations; translation is how far from its place the source's centroid ends, so that
-  no error depends on where the origin lies. **Failed**: over 5 degrees; for lidar over 1 degree or 0.5 m.
+  no error depends on where the origin lies. **Failed**: over 5 degrees; for lidar over 1 degree or 0.2 m.
 - **Cells** are median / 90th percentile in degrees, failures included, and in brackets how many failed, where any did.
   The lowest median of all but the paper's variants is bold. **s** is processor seconds per registration in the last
   column's trials, normals and trees included where the method makes them.
 - **Repeats**: {repeats} per cell, {twice} in Figs. 6 and 7, {half} per lidar pair. The paper's own variants,
-  `BBRLayer.paper(...)`, take seconds to minutes each and have {variants} (N {slow}), shared sampling only, at most 500
-  points. That few repeats tell a basin, not a percentage.
+  `BBRLayer.paper(...)`, take seconds to a minute each and have at most {variants} (N {slow}), in some places, shared
+  sampling only, at most 500 points. That few repeats tell a basin, not a percentage.
 - **Ours**: `BBRLayer()`, `BBRLayer.fast()` and `BBRLayer.robust()` without any argument; on lidar also
   `BBRLayer("F")`, the paper's loss alone. Lidar scans are thinned to {all} points as in the paper, for FPFH + RANSAC
   to {features}.
 - **Peers** run at the better of two settings, chosen for each experiment and sampling on {chosen} other seeds per cell
-  (lidar: half as many): fewest failures, then lowest error. They begin where our layer begins: in place or centroid on
+  (lidar: half as many): fewest failures, then lowest errors. They begin where our layer begins: in place or centroid on
   centroid, whichever lies better. Their unit is the point spacing, on lidar {unit:g} m. GICP and VGICP find their own
   normals, as in the paper. FPFH + RANSAC ends with the narrow run of Open3D's symmetric ICP.
 """

@@ -148,5 +148,5 @@ def test_results_survive_on_disk_and_are_told_apart_by_seed(tmp_path):
 
 def test_a_lidar_answer_may_fail_by_its_translation():
     lidar: Experiment = next(x for x in EXPERIMENTS if x.name == "lidar")
-    scores = Scores(np.array([0.1, 0.1, 2.0]), np.array([0.1, 0.6, 0.1]), np.zeros(3))
+    scores = Scores(np.array([0.1, 0.1, 2.0]), np.array([0.1, 0.3, 0.1]), np.zeros(3))
     assert scores.failed(lidar) == 2
