@@ -42,6 +42,7 @@ from bbr_layer.stage import Stage as Stage
 from bbr_layer.temperature import Annealed as Annealed
 from bbr_layer.temperature import Learned as Learned
 from bbr_layer.temperature import Unrounded as Unrounded
+from bbr_layer.thinning import evenly_thinned as evenly_thinned
 from bbr_layer.trajectories import read_poses as read_poses
 from bbr_layer.trajectories import read_poses_kitti as read_poses_kitti
 from bbr_layer.trajectories import read_poses_tum as read_poses_tum

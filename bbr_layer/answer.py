@@ -89,7 +89,7 @@ def show(console: Console, found: TwoClouds, answer: dict[str, Any], out: Path |
         ("translation", "  ".join(f"{number:.6g}" for number in answer["translation"])),
         ("status", answer["status"]),
         ("best buddies", f"{answer['buddies']}, {answer['buddy_share']:.1%} of the smaller cloud's points"),
-        ("their RMS distance", f"{answer['residual_rms']:.4g}"),
+        ("their RMS residual", f"{answer['residual_rms']:.4g}"),
         ("confidence", f"{answer['confidence']:.2f}"),
         *(("free direction" if direction.free else "weakest direction", direction.words) for direction in weak),
         ("points", f"{read['target']} and {read['source']}"),

@@ -5,7 +5,8 @@ from functools import partial
 from bbr_layer.backward import Backward
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.pair import CloudPair, Frame
-from bbr_layer.stage import Stage, StageResult
+from bbr_layer.registration import StageResult
+from bbr_layer.stage import Stage
 
 
 def descended(stages: list[Stage], clouds: tuple[CloudPair, Frame], motion: RigidMotion, mode: Backward) -> StageResult:

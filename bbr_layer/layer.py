@@ -171,10 +171,7 @@ class BBRLayer(nn.Module):
                 ended = descended(stages, (pair, frame), motion, Replay())
             elif doubt:
                 speak_up(mode, doubt)
-        trust = judged(pair, frame, ended.motion, ended.settled)
-        iterations = torch.full_like(trust.buddies, sum(stage.inner.steps for stage in stages))
-        found = ended.loss, ended.temperature, ended.gradient_norm
-        return Registration(ended.motion, *found, iterations, *trust)
+        return judged(pair, frame, ended, sum(stage.inner.steps for stage in stages))
 
     def _wants_gradient(self, pair: CloudPair, start: RigidMotion | None) -> bool:
         settings = [x for m in self.modules() for x in vars(m).values() if isinstance(x, Tensor)]

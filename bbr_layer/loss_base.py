@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bbr_layer.buddies import OUTLIER_CONSTANT, soft_buddies
-from bbr_layer.distances import smooth_root, squared_distances
+from bbr_layer.distances import point_to_point, smooth_root, squared_distances
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.scene import Kernel, SoftTerms
 from bbr_layer.kernels.soft import SoftKernel
@@ -99,9 +99,9 @@ class SoftLoss(Loss):
             pair.both_features()
         return SoftSquares(self, self.terms(match))
 
-    @abstractmethod
     def distances(self, pair: CloudPair) -> Float[Tensor, "batch n m"]:
         """What the loss lowers, for every pair of points."""
+        return point_to_point(pair, self.rounding(pair))
 
     @abstractmethod
     def terms(self, match: str) -> SoftTerms:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bbr_layer.buddies import OUTLIER_CONSTANT
-from bbr_layer.distances import matched_plane_normals, point_to_point, smooth_root, symmetric_point_to_plane
+from bbr_layer.distances import matched_plane_normals, smooth_root, symmetric_point_to_plane
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.scene import Kernel, SoftTerms
@@ -50,9 +50,6 @@ class SoftBBS(SoftLoss):
     def terms(self, match: str) -> SoftTerms:
         return SoftTerms(mean=False, outlier=self.outlier, match=match, feature_weight=self.feature_weight)
 
-    def distances(self, pair: CloudPair) -> Float[Tensor, "batch n m"]:
-        return point_to_point(pair, self.rounding(pair))
-
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         return -self.buddies(pair, self.distances(pair), temperature).sum((-1, -2), dtype=torch.float64)
 
@@ -66,9 +63,6 @@ class SoftBD(SoftLoss):
 
     def terms(self, match: str) -> SoftTerms:
         return SoftTerms(mean=True, outlier=self.outlier, match=match, feature_weight=self.feature_weight)
-
-    def distances(self, pair: CloudPair) -> Float[Tensor, "batch n m"]:
-        return point_to_point(pair, self.rounding(pair))
 
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         distances = self.distances(pair)

@@ -23,20 +23,28 @@ def default_stages(soft_points: int = SOFT_POINTS) -> list[Stage]:
 
     Of more than 10 000 points the first steps see fewer, and the last 30 all.
     """
-    soft = Stage(SoftBBS(smoothing=SOFT_SMOOTHING), Adam(60, 0.1), Annealed(2.0, 1.0), points=soft_points)
-    fine = Stage(BuddyFilter(), Adam(200, 0.005), Annealed(0.3, 0.03), points=FINE_POINTS)
-    return [soft, fine, Stage(BuddyFilter(), Adam(30, 0.001), Annealed(0.3, 0.03), above=FINE_POINTS)]
+    last = named_stage("F", Adam(30, 0.001), above=FINE_POINTS)
+    return [named_stage("softBBS", points=soft_points), named_stage("F", points=FINE_POINTS), last]
 
 
 def fast_stages(soft_points: int = FAST_SOFT_POINTS) -> list[Stage]:
     """The same with soft buddies of fewer points and Gauss-Newton instead of most steps."""
-    soft = Stage(SoftBBS(smoothing=SOFT_SMOOTHING), Adam(40, 0.1), Annealed(2.0, 1.0), points=soft_points)
-    fine = Stage(BuddyFilter(), GaussNewton(8), Annealed(0.3, 0.03), points=FINE_POINTS)
-    return [soft, fine, Stage(BuddyFilter(), GaussNewton(3), Annealed(0.1, 0.03), above=FINE_POINTS)]
+    soft = named_stage("softBBS", Adam(40, 0.1), points=soft_points)
+    last = named_stage("F", GaussNewton(3), Annealed(0.1, 0.03), above=FINE_POINTS)
+    return [soft, named_stage("F", GaussNewton(8), points=FINE_POINTS), last]
 
 
-def named_stage(name: str, inner: Inner | None = None, temperature: Temperature | None = None) -> Stage:
+def named_stage(
+    name: str,
+    inner: Inner | None = None,
+    temperature: Temperature | None = None,
+    *,
+    points: int | None = None,
+    above: int = 0,
+) -> Stage:
     """One scale-free stage by the paper's name of its loss: ``"softBBS"``, ``"softBD"``, ``"N"`` or ``"F"``.
+
+    What is not given is the measured setting; the rest as ``Stage`` has it.
 
     Raises
     ------
@@ -48,7 +56,8 @@ def named_stage(name: str, inner: Inner | None = None, temperature: Temperature 
         )
     loss, steps, rate, start, end = _NAMED[name]
     inner = Adam(steps, rate) if inner is None else inner
-    return Stage(loss(), inner, Annealed(start, end) if temperature is None else temperature)
+    temperature = Annealed(start, end) if temperature is None else temperature
+    return Stage(loss(), inner, temperature, points=points, above=above)
 
 
 # Loss, steps, rate, and temperature from and to in point spacings. softBBS and F: measured on the bunny, horse and

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bbr_layer.cloud_trees import tree_of
+from bbr_layer.embedding import matrices_in_space
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.margins import Margins, MutualMargins, Pose
 from bbr_layer.trees import Tree, in_space
@@ -72,7 +73,7 @@ class MutualNeighbours:
         """
         motion = motion.detach()
         if self.device.type == "cpu":
-            rotation = in_space(in_space(motion.rotation.double().numpy()).swapaxes(1, 2)).swapaxes(1, 2)
+            rotation = matrices_in_space(motion.rotation.double().numpy())
             translation = in_space(motion.translation.double().numpy())
             found = [self.of_item(b, pose) for b, pose in enumerate(zip(rotation, translation, strict=True))]
             tables = [(torch.from_numpy(index), torch.from_numpy(mutual)) for index, mutual in found]

@@ -4,7 +4,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bbr_layer.confidence import confidence, judged_clouds
@@ -109,27 +109,26 @@ class Registration(NamedTuple):
         return Registration(motion, *(x.reshape((*batch, *x.shape[1:])) for x in self[1:]))
 
 
-class Trust(NamedTuple):
-    """The fields of ``Registration`` from ``buddies`` on."""
+class StageResult(NamedTuple):
+    """Where a stage ended; temperatures in the data's unit."""
 
-    buddies: Int[Tensor, "batch"]
-    information: Float[Tensor, "batch k k"]
-    status: Int[Tensor, "batch"]
-    resistance: Float[Tensor, "batch k k"]
-    residual: Float[Tensor, "batch"]
-    radius: Float[Tensor, "batch"]
-    confidence: Float[Tensor, "batch"]
+    motion: RigidMotion  # between the user's frames
+    loss: Tensor
+    temperature: Tensor
+    gradient_norm: Tensor
+    settled: Tensor
 
 
 @torch.no_grad()
-def judged(pair: CloudPair, frame: Frame, motion: RigidMotion, settled: Bool[Tensor, "batch"]) -> Trust:
-    """What the pairs say about an answer.
+def judged(pair: CloudPair, frame: Frame, ended: StageResult, steps: int) -> Registration:
+    """The answer of a registration whose last stage ``ended``, with what its pairs say about it.
 
     Parameters
     ----------
-    pair, frame: the centred clouds; ``motion`` between the user's frames.
-    settled: whether the last steps still moved it.
+    pair, frame: the centred clouds.
+    steps: of all stages.
     """
+    motion = ended.motion
     entered = frame.enter(motion)
     found = matched(pair, entered)
     information, residual = matched_information(pair, entered, frame, found)
@@ -141,13 +140,14 @@ def judged(pair: CloudPair, frame: Frame, motion: RigidMotion, settled: Bool[Ten
     radius = centre_and_radius(pair.Q, pair.Q_mask)[1] * frame.scale
     radius = torch.where(radius > 0, radius, 1.0)
     free = spectrum(held, radius)[2].any(-1)
-    status = torch.where(settled, int(Status.CONVERGED), int(Status.ITERATION_LIMIT))
+    status = torch.where(ended.settled, int(Status.CONVERGED), int(Status.ITERATION_LIMIT))
     status = torch.where(free, int(Status.DEGENERATE), status)
     status = torch.where(buddies == 0, int(Status.NO_BUDDIES), status)
     finite = torch.isfinite(motion.translation).all(-1) & torch.isfinite(motion.rotation).all(-1).all(-1)
     status = torch.where(finite, status, int(Status.NON_FINITE))
     believed = torch.where(status <= int(Status.ITERATION_LIMIT), confidence(seen, pairs), 0.0)
-    return Trust(buddies, information, status, held, residual, radius, believed)
+    before = ended.loss, ended.temperature, ended.gradient_norm, torch.full_like(buddies, steps)
+    return Registration(motion, *before, buddies, information, status, held, residual, radius, believed)
 
 
 def _same(seen: CloudPair, pair: CloudPair) -> bool:

@@ -1,7 +1,6 @@
 """One stage of the layer: a loss, the optimiser that lowers it, and its temperature; and the stages by name."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +16,7 @@ from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.inner.unroll import Problem, cut_from_graph, value
 from bbr_layer.loss_base import Loss, Objective, SoftLoss
 from bbr_layer.pair import CloudPair, Frame, centre_and_radius
+from bbr_layer.registration import StageResult
 from bbr_layer.temperature import Annealed, Temperature, Unrounded
 from bbr_layer.thinning import thinned_pair
 
@@ -30,16 +30,6 @@ FEWEST_POINTS = 4
 
 
 Inner = Adam | GaussNewton
-
-
-class StageResult(NamedTuple):
-    """Where a stage ended; temperatures in the data's unit."""
-
-    motion: RigidMotion  # between the user's frames
-    loss: Tensor
-    temperature: Tensor
-    gradient_norm: Tensor
-    settled: Tensor
 
 
 class Stage(nn.Module):

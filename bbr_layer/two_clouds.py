@@ -63,8 +63,7 @@ def register_clouds(
     result = layer(P, Q, P_normals=normals[0], Q_normals=normals[1], start=motion)
     if not np.isfinite(result.target_from_source.matrix.numpy()).all():
         raise ValueError(str(result.words))
-    moved = result.target_from_source(Q).numpy()
-    verdict = give_verdict(target.points, moved, float(result.confidence), str(result.words))
+    verdict = give_verdict(result, min(len(P), len(Q)))
     return TwoClouds(result, verdict, result.target_from_source.matrix.numpy())
 
 
@@ -73,9 +72,7 @@ def _stages(loss: str, preset: str, soft_points: int) -> list[Stage]:
         return fast_stages(min(soft_points, FAST_SOFT_POINTS)) if preset == "fast" else default_stages(soft_points)
     if preset != DEFAULT_LOSS:
         raise ValueError(f"loss is {loss} and preset is {preset}; a preset has its own losses: give one of the two")
-    stage = named_stage(loss)
-    points = None if loss == "F" else soft_points
-    return [Stage(stage.loss, stage.inner, stage.temperature, points=points)]
+    return [named_stage(loss, points=None if loss == "F" else soft_points)]
 
 
 def common_dimension(target: Cloud, source: Cloud) -> tuple[Cloud, Cloud]:

@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float
-from scipy.spatial import cKDTree
+from bbr_layer.registration import Registration
 
 # An answer is believed from this probability on. `python -m benchmarks.reliability`: 13 of 532 wrong answers are above
 # it and 2 of 1132 right ones below; a threshold on the share of close pairs trusted 29 and doubted 23.
@@ -19,7 +17,7 @@ class Verdict:
     ----------
     buddies: how many pairs are mutual nearest neighbours.
     buddy_share: as a share of the smaller cloud.
-    residual_rms: root mean square distance of the pairs, in the data's unit.
+    residual_rms: ``Registration.residual``, point to plane where the loss has normals.
     confidence: probability that the answer is right, as ``Registration`` has it.
     trustworthy: whether everything speaks for the answer.
     sentence: the same in words.
@@ -33,33 +31,24 @@ class Verdict:
     sentence: str
 
 
-def give_verdict(
-    P: Float[np.ndarray, "n d"], moved: Float[np.ndarray, "m d"], confidence: float, status_words: str
-) -> Verdict:
-    """Judge an answer.
+def give_verdict(found: Registration, points: int) -> Verdict:
+    """Judge an answer without batch dimensions.
 
     Parameters
     ----------
-    P, moved: ``(n, d)`` target and ``(m, d)`` source already carried onto it.
-    confidence, status_words: as ``Registration`` has them; anything but "converged" forbids trust.
+    found: the answer; words other than "converged" forbid trust.
+    points: of the smaller cloud.
     """
-    distances = _pair_distances(P, moved)
-    doubts = _doubts(status_words, confidence)
+    confidence, buddies = float(found.confidence), int(found.buddies)
+    doubts = _doubts(str(found.words), confidence)
     return Verdict(
-        buddies=len(distances),
-        buddy_share=len(distances) / min(len(P), len(moved)),
-        residual_rms=float(np.sqrt(np.mean(distances**2))),
+        buddies=buddies,
+        buddy_share=buddies / points,
+        residual_rms=float(found.residual),
         confidence=confidence,
         trustworthy=not doubts,
         sentence=_sentence(doubts, confidence),
     )
-
-
-def _pair_distances(P: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Distances of the mutual nearest neighbours, ``(b,)``."""
-    to_target, nearest_target = cKDTree(P).query(moved)
-    mutual = cKDTree(moved).query(P)[1][nearest_target] == np.arange(len(moved))
-    return to_target[mutual]
 
 
 def _doubts(status_words: str, confidence: float) -> list[str]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bbr_layer import RigidMotion, estimate_normals
+from bbr_layer import RigidMotion, angular_error, estimate_normals
 
 SAMPLINGS = ("shared", "disjoint")
 PAPER_NEIGHBOURS = 13  # of a normal in a full model or scan (paper, 4.1)
@@ -70,11 +70,10 @@ class Trial(NamedTuple):
 
     def errors(self, found: RigidMotion) -> tuple[float, float]:
         """Degrees between the rotations, and how far from its place the source's centroid ends, in data units."""
-        turn = self.truth.rotation.mT @ found.rotation.double()
-        chord = torch.linalg.matrix_norm(turn - torch.eye(3, dtype=torch.float64)).item()
+        degrees = math.degrees(angular_error(found.rotation.double(), self.truth.rotation).item())
         centre = self.Q.mean(0, keepdim=True)
         apart = (self.truth(centre) - found(centre)).norm().item()
-        return math.degrees(2 * math.asin(min(chord / math.sqrt(8), 1.0))), apart
+        return degrees, apart
 
 
 Make = Callable[[int], Trial]

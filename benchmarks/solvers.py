@@ -5,8 +5,8 @@
 Trials as in ``benchmarks.starts``: two random subsets of 500 points of one model that share no point, float32, normals
 of their own. Gradients: subsets of 100 to 500 points of the bunny, float64, turned by 15 degrees, the source another
 subset or an exact copy; the derivative of a fixed mix of the pose's six numbers along 12 random directions of all
-coordinates, against central differences. Their step is 1e-9 of random directions of unit components in metres, about a
-hundred-millionth of the cloud: at larger ones buddies change hands between the two sides.
+coordinates, against central differences. Their step is 1e-9 m of directions with unit components, on a cloud of 5 cm:
+at larger ones buddies change hands between the two sides.
 """
 
 import argparse

@@ -15,7 +15,7 @@ ORDER = {
         checks
         rotations
         geometry
-        pair trees
+        embedding pair trees
         kernels
         kernels.cpu_math kernels.cpu_threads
         kernels.cpu_walk kernels.cpu_turns kernels.cpu_axes

@@ -8,8 +8,10 @@ import pytest
 import torch
 from torch.func import vmap
 
-from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, Status, register
+from bbr_layer import Adam, BBRLayer, CloudPair, Detached, RigidMotion, Status, register
 from bbr_layer.confidence import COEFFICIENTS
+from bbr_layer.preparation import prepared
+from bbr_layer.registration import StageResult, judged
 from benchmarks.reliability import fitted, loaded
 
 N = 500
@@ -133,8 +135,11 @@ def test_confidence_has_no_gradient_and_failures_have_none_of_it(rng):
     assert not result.confidence.requires_grad and result.loss.requires_grad
     empty = LAYER(P, Q.detach(), P_mask=torch.zeros(60, dtype=torch.bool))
     assert empty.status == Status.NO_BUDDIES and empty.confidence == 0
-    lost = BBRLayer("softBD", inner=Adam(3, 1e308))(P, 1e3 * Q.detach())
-    assert lost.confidence == 0 or torch.isfinite(lost.target_from_source.matrix).all()
+    nowhere = RigidMotion(torch.eye(3)[None].double(), torch.full((1, 3), torch.nan, dtype=torch.float64))
+    frame, pair = prepared(CloudPair(P[None], Q.detach()[None]), False, True)
+    ended = StageResult(nowhere, *torch.zeros(3, 1, dtype=torch.float64), torch.tensor([True]))
+    lost = judged(pair, frame, ended, 1)
+    assert lost.status.item() == Status.NON_FINITE and lost.confidence.item() == 0
 
 
 def test_many_points_are_judged_by_the_same_few_each_time(rng):

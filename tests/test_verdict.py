@@ -4,32 +4,43 @@ import numpy as np
 import pytest
 import torch
 
+from bbr_layer import Adam, BBRLayer, RigidMotion, Status
 from bbr_layer.directions import named
 from bbr_layer.verdict import BELIEVED, give_verdict
 
 
-def test_pairs_are_counted_as_loops_would(rng):
-    P, moved = rng.normal(size=(12, 3)), rng.normal(size=(9, 3))
-    D = np.linalg.norm(P[:, None] - moved[None], axis=-1)
+@pytest.fixture
+def found(rng):
+    """Twelve points, nine, and an answer on them whose pairs are counted below."""
+    P, Q = (torch.from_numpy(rng.normal(size=(n, 3))) for n in (12, 9))
+    return P, Q, BBRLayer("softBD", inner=Adam(1, 1e-9))(P, Q, start=RigidMotion.identity(3))
+
+
+def test_pairs_are_counted_as_loops_would(found):
+    P, Q, answer = found
+    D = (P[:, None] - Q).norm(dim=-1)
     pairs = [(i, j) for i in range(12) for j in range(9) if D[i, j] == D[i].min() == D[:, j].min()]
-    verdict = give_verdict(P, moved, 0.9, "converged")
+    verdict = give_verdict(answer, 9)
     assert verdict.buddies == len(pairs)
     assert verdict.buddy_share == len(pairs) / 9
-    assert verdict.residual_rms == pytest.approx(np.sqrt(np.mean([D[i, j] ** 2 for i, j in pairs])))
+    squares = [float(D[i, j]) ** 2 for i, j in pairs]
+    assert verdict.residual_rms == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-6)
 
 
-def test_confidence_decides_and_is_said(rng):
-    P = rng.normal(size=(30, 3))
-    sure, doubtful = (give_verdict(P, P, BELIEVED + step, "converged") for step in (0.01, -0.01))
+def test_confidence_decides_and_is_said(found):
+    converged = found[2]._replace(status=torch.tensor(Status.CONVERGED))
+    sure, doubtful = (
+        give_verdict(converged._replace(confidence=torch.tensor(BELIEVED + step)), 9) for step in (0.01, -0.01)
+    )
     assert sure.trustworthy and sure.sentence == "Trustworthy: the probability that it is right is 0.51."
     assert not doubtful.trustworthy and "the probability that it is right is 0.49" in doubtful.sentence
 
 
-def test_words_other_than_converged_forbid_trust(rng):
-    P = rng.normal(size=(30, 3))
-    verdict = give_verdict(P, P, 1.0, "the pose was still moving: give it more steps")
+def test_words_other_than_converged_forbid_trust(found):
+    moving = found[2]._replace(status=torch.tensor(Status.ITERATION_LIMIT), confidence=torch.tensor(1.0))
+    verdict = give_verdict(moving, 9)
     assert not verdict.trustworthy
-    assert "the pose was still moving." in verdict.sentence.replace(". Try", ".")
+    assert "the pose was still moving at the last step." in verdict.sentence.replace(". Try", ".")
 
 
 def test_deviation_is_that_of_a_mean():

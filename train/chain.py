@@ -1,5 +1,7 @@
 """The first edges, found without any poses: each scan with the one before; few scans in space all with all."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -49,7 +51,7 @@ def all_pairs(scene: Scene, chain: Edges, progress: Progress) -> Edges:
     return found.kept(found.score > FOUND * torch.quantile(chain.score, 0.5))
 
 
-def _tried(edges: Edges, doubtful: Tensor, again) -> Edges:  # type: ignore[no-untyped-def]
+def _tried(edges: Edges, doubtful: Tensor, again: Callable[[Edges, Tensor], Edges]) -> Edges:
     """The edges, the ``doubtful`` ones replaced where ``again(edges, rows)`` finds better ones."""
     rows = torch.nonzero(doubtful)[:, 0]
     if not len(rows):

@@ -7,6 +7,7 @@ the likelier both are right.
 
 import numpy as np
 from jaxtyping import Float
+from trimesh.registration import procrustes
 
 # Matches around one seed that give its motion, and seeds tried.
 GROUP, SEEDS = 20, 60
@@ -15,8 +16,8 @@ APART = 3.0
 
 
 def consensus(
-    target: Float[np.ndarray, "c d"], source: Float[np.ndarray, "c d"], tolerance: float, most: int
-) -> list[Float[np.ndarray, "d1 d1"]]:
+    target: Float[np.ndarray, "c 3"], source: Float[np.ndarray, "c 3"], tolerance: float, most: int
+) -> list[Float[np.ndarray, "4 4"]]:
     """At most ``most`` different motions ``target_from_source``, those that most matches agree with first.
 
     Parameters
@@ -51,16 +52,9 @@ def consensus(
     return chosen
 
 
-def placed(target: Float[np.ndarray, "n d"], source: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "d1 d1"]:
-    """The rigid motion that brings ``source`` closest to ``target`` (Kabsch)."""
-    d = target.shape[1]
-    u, _, v = np.linalg.svd((target - target.mean(0)).T @ (source - source.mean(0)))
-    signs = np.ones(d)
-    signs[-1] = np.sign(np.linalg.det(u @ v))
-    motion = np.eye(d + 1)
-    motion[:d, :d] = (u * signs) @ v
-    motion[:d, d] = target.mean(0) - motion[:d, :d] @ source.mean(0)
-    return motion
+def placed(target: Float[np.ndarray, "n 3"], source: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
+    """The rigid motion that brings ``source`` closest to ``target``."""
+    return procrustes(source, target, reflection=False, scale=False, return_cost=False)
 
 
 def _off(motion: np.ndarray, target: np.ndarray, source: np.ndarray) -> np.ndarray:

@@ -52,13 +52,12 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
     if (steps := min(config.window, len(scans) - 1)) > 1:
         edges = edges.joined(_window(scene, poses, steps, progress))
         poses, belief = solve_pose_graph(edges, poses)
-    weights = _point_weights(scene, edges, poses)
     for _ in range(config.rounds if config.loops_per_scan else 0):
+        weights = _point_weights(scene, edges, poses)
         edges = _again(scene, edges, belief, poses, weights)
         edges = edges.kept((edges.kind < 2) | (belief >= DOUBTED))
         edges = edges.joined(_loops(scene, poses, edges, config, progress, weights=weights))
         poses, belief = solve_pose_graph(edges, poses)
-        weights = _point_weights(scene, edges, poses)
     edges = edges._replace(score=edges.score * belief)
     return edges, _refined(full, scene, (edges, belief), poses, progress)
 

@@ -76,9 +76,7 @@ def spanning_poses(edges: Edges, scans: int) -> RigidMotion:
     numbers = (edges.target.numpy(), edges.source.numpy())
     # Costs are positive, as a sparse 0 would be no edge; of two edges of one pair the best is left.
     costs = 2.0 - edges.score.clamp(0, 1).numpy()
-    best = {
-        pair: edge for edge in np.argsort(-costs).tolist() for pair in [(int(numbers[0][edge]), int(numbers[1][edge]))]
-    }
+    best = {(int(numbers[0][edge]), int(numbers[1][edge])): edge for edge in np.argsort(-costs).tolist()}
     kept = np.array(list(best.values()))
     graph = csr_array((costs[kept], (numbers[0][kept], numbers[1][kept])), shape=(scans, scans))
     order, before = breadth_first_order(minimum_spanning_tree(graph), 0, directed=False)

@@ -2,11 +2,10 @@
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from bbr_layer import estimate_normals
+from bbr_layer import estimate_normals, evenly_thinned
 from train.scans import ScanSet
 
 # Normals are fitted to this many neighbours of the full scan before it is thinned: a line in 2D, the paper's 13 in 3D.
@@ -22,12 +21,12 @@ class Prepared(NamedTuple):
 
 
 def prepare(scans: ScanSet, most: int) -> Prepared:
-    """Normals from the full scans, then at most ``most`` points of each, spread evenly over its order."""
+    """Normals from the full scans, then at most ``most`` points of each, spread evenly in space."""
     neighbours = NORMAL_NEIGHBOURS[scans.dimension]
     chosen, normals = [], []
     for scan in scans.points:
         points = torch.from_numpy(scan)
-        kept = torch.from_numpy(_thinned(scan, most))
+        kept = torch.from_numpy(evenly_thinned(scan, most))
         chosen.append(points[kept])
         normals.append(estimate_normals(points, neighbours)[kept])
     return _padded(chosen, normals)
@@ -37,7 +36,7 @@ def thinned(prepared: Prepared, most: int) -> Prepared:
     """At most ``most`` of the points of each scan, even in space."""
     chosen, normals = [], []
     for points, directions, mask in zip(*prepared, strict=True):
-        kept = torch.from_numpy(_thinned(points[mask].double().numpy(), most))
+        kept = torch.from_numpy(evenly_thinned(points[mask].double().numpy(), most))
         chosen.append(points[mask][kept])
         normals.append(directions[mask][kept])
     return _padded(chosen, normals)
@@ -47,17 +46,3 @@ def _padded(chosen: list[Tensor], normals: list[Tensor]) -> Prepared:
     sizes = torch.tensor([len(points) for points in chosen])
     points, directions = (torch.nn.utils.rnn.pad_sequence(x, batch_first=True).float() for x in (chosen, normals))
     return Prepared(points, directions, torch.arange(int(sizes.max())) < sizes[:, None])
-
-
-def _thinned(scan: np.ndarray, most: int) -> np.ndarray:
-    """Numbers of at most ``most`` points, one per cell of the finest grid that leaves so few: even in space."""
-    if len(scan) <= most:
-        return np.arange(len(scan))
-    low, high = 0.0, float(np.ptp(scan, axis=0).max())
-    kept = np.arange(len(scan))
-    for _ in range(20):  # bisection: 20 halvings tell the cell size to a millionth of the extent
-        cell = (low + high) / 2
-        _, first = np.unique(np.floor(scan / cell).astype(np.int64), axis=0, return_index=True)
-        low, high = (cell, high) if len(first) > most else (low, cell)
-        kept = first if len(first) <= most else kept
-    return np.sort(kept)

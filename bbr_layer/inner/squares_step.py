@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bbr_layer.embedding import AXES, matrices_in_space
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.gauss_newton import solved
 from bbr_layer.inner.once import once
@@ -13,9 +14,6 @@ from bbr_layer.kernels.choice import backend
 from bbr_layer.kernels.squares import Equations, MatchedSquares, Squares
 from bbr_layer.pair import CloudPair
 from bbr_layer.trees import in_space
-
-# The components of a turn and shift in space that are free in the plane and in space.
-AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
 
 
 class BoundSquares:
@@ -54,7 +52,7 @@ class BoundSquares:
 
         if self._clouds is None:
             self._clouds = matched_clouds(self.pair)
-        pose = _in_space(motion.rotation.numpy()), in_space(motion.translation.numpy())
+        pose = matrices_in_space(motion.rotation.numpy()), in_space(motion.translation.numpy())
         pairs = zip(*(x.numpy() for x in held), strict=True)
         each = zip(self._clouds, pairs, zip(*pose, strict=True), temperature.tolist(), strict=True)
         found = [equations_of(*item) for item in each]
@@ -85,12 +83,3 @@ class _Step(torch.autograd.Function):
         found = iter(torch.autograd.grad(step, wanted, cotangent.detach(), allow_unused=True))
         answers = [next(found) if x is not None and x.requires_grad else None for x in given]
         return None, None, None, *once(answers, (*saved, cotangent))
-
-
-def _in_space(rotation: np.ndarray) -> np.ndarray:
-    """Rotations ``(batch, d, d)`` in space, those of the plane with a one in the corner."""
-    whole = np.zeros((len(rotation), 3, 3))
-    d = rotation.shape[-1]
-    whole[:, 2, 2] = 1.0
-    whole[:, :d, :d] = rotation
-    return whole

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bbr_layer.embedding import AXES, matrices_in_space
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.once import once
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace
@@ -18,9 +19,6 @@ from bbr_layer.kernels.cpu_course import Adjoint
 from bbr_layer.kernels.cpu_threads import side_by_side
 from bbr_layer.pair import CloudPair
 from bbr_layer.trees import in_space
-
-# The components of a tangent in space that are free, rotation first.
-AXES = {2: [2, 3, 4], 3: [0, 1, 2, 3, 4, 5]}
 
 Tables = TypeVar("Tables", Trace, Back, Adjoint)
 
@@ -119,7 +117,7 @@ class _Walk(torch.autograd.Function):
         (count, batch), axes = temperatures.shape, AXES[d]
         adjoint = _zero(batch, pair.P.shape[1], pair.Q.shape[1])
         moments = (_spread(x, axes) for x in cotangents[2:4])
-        back = Back(_in_space(cotangents[0], 0.0), in_space(cotangents[1].numpy()).copy(), *moments)
+        back = Back(matrices_in_space(cotangents[0].numpy(), 0.0), in_space(cotangents[1].numpy()).copy(), *moments)
         heats, speeds = np.zeros((batch, count)), np.zeros((batch, count, 6))
 
         def work(b: int) -> None:
@@ -139,7 +137,12 @@ def _begun(steps: int, rotation: Tensor, translation: Tensor, first: Tensor, sec
     batch, axes = len(translation), AXES[translation.shape[-1]]
     shapes = (steps + 1, 3, 3), (steps + 1, 3), (steps + 1, 6), (steps + 1, 6), (steps, 6)
     trace = Trace(*(np.zeros((batch, *shape)) for shape in shapes))
-    starts = _in_space(rotation, 1.0), in_space(translation.numpy()), _spread(first, axes), _spread(second, axes)
+    starts = (
+        matrices_in_space(rotation.numpy()),
+        in_space(translation.numpy()),
+        _spread(first, axes),
+        _spread(second, axes),
+    )
     for table, values in zip(trace, starts, strict=False):
         table[:, 0] = values
     return trace
@@ -166,17 +169,6 @@ def _spread(values: Tensor, axes: list[int]) -> np.ndarray:
     """Free components ``(rows, k)`` in six columns."""
     whole = np.zeros((len(values), 6))
     whole[:, axes] = values.numpy()
-    return whole
-
-
-def _in_space(rotation: Tensor, last: float) -> np.ndarray:
-    """Matrices of the plane in space, with ``last`` on the third axis; a copy."""
-    matrices = rotation.numpy()
-    whole = np.zeros((len(matrices), 3, 3))
-    d = matrices.shape[-1]
-    whole[:, :d, :d] = matrices
-    if d == 2:
-        whole[:, 2, 2] = last
     return whole
 
 

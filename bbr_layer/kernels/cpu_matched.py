@@ -71,23 +71,31 @@ def _place(clouds, i, j, pose):  # type: ignore[no-untyped-def]
 
 
 @compiled()
+def _pull(clouds, pairs, j, placing):  # type: ignore[no-untyped-def]
+    """How much a pair pulls per unit of its residual, the residual, and its derivative by a turn and by a shift.
+
+    ``placing`` is (pose, temperature, one over the weight of all pairs).
+    """
+    (index, _), (pose, temperature, scale) = pairs, placing
+    arm, turned, offset, plane, _ = _place(clouds, index[j], j, pose)
+    residual = _dot(offset, plane)
+    squared = residual * residual + temperature * temperature
+    weight = scale * clouds.P_weights[index[j]] * clouds.Q_weights[j]
+    torque = _combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
+    return weight / (np.sqrt(squared) if squared > 0 else 1.0), residual, torque, plane
+
+
+@compiled()
 def slope_of(clouds, pairs, pose, temperature):  # type: ignore[no-untyped-def]
     """The mean rounded distance's gradient by a turn and shift, ``(6,)``; ``pairs`` is (index, mutual)."""
     index, mutual = pairs
-    slope, scale = np.zeros(TANGENT), _scale(clouds, index, mutual)
+    slope, placing = np.zeros(TANGENT), (pose, temperature, _scale(clouds, index, mutual))
     for j in range(len(index)):
-        if not mutual[j]:
-            continue
-        i = index[j]
-        arm, turned, offset, plane, _ = _place(clouds, i, j, pose)
-        residual = _dot(offset, plane)
-        squared = residual * residual + temperature * temperature
-        if squared > 0:
-            push = scale * clouds.P_weights[i] * clouds.Q_weights[j] * residual / np.sqrt(squared)
-            torque = _combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
+        if mutual[j]:
+            pull, residual, torque, plane = _pull(clouds, pairs, j, placing)
             for k in range(3):
-                slope[k] += push * torque[k]
-                slope[3 + k] += push * plane[k]
+                slope[k] += pull * residual * torque[k]
+                slope[3 + k] += pull * residual * plane[k]
     return slope
 
 
@@ -96,16 +104,11 @@ def equations_of(clouds, pairs, pose, temperature):  # type: ignore[no-untyped-d
     """Normal equations of a Gauss-Newton step, ``(6, 6)`` and ``(6,)``; see ``MatchedSquares``."""
     index, mutual = pairs
     matrix, slope, row = np.zeros((TANGENT, TANGENT)), np.zeros(TANGENT), np.empty(TANGENT)
-    scale = _scale(clouds, index, mutual)
+    placing = pose, temperature, _scale(clouds, index, mutual)
     for j in range(len(index)):
         if not mutual[j]:
             continue
-        i = index[j]
-        arm, turned, offset, plane, _ = _place(clouds, i, j, pose)
-        residual = _dot(offset, plane)
-        squared = residual * residual + temperature * temperature
-        pull = scale * clouds.P_weights[i] * clouds.Q_weights[j] / (np.sqrt(squared) if squared > 0 else 1.0)
-        torque = _combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
+        pull, residual, torque, plane = _pull(clouds, pairs, j, placing)
         for k in range(3):
             row[k], row[3 + k] = torque[k], plane[k]
         for k in range(TANGENT):
