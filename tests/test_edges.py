@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from bbr_layer import RigidMotion, angular_error
+from train.chain import POOR, consecutive
 from train.config import EdgeConfig
-from train.edges import register_edges
+from train.edges import _again, register_edges
 from train.pose_graph import Edges, solve_pose_graph, spanning_poses
 from train.prepared import prepare
-from train.scans import ScanSet
+from train.scans import ScanSet, silent
+from train.scene import build_scene
 
 
 def _circle(scans: int, d: int) -> RigidMotion:
@@ -83,6 +85,16 @@ def test_the_first_poses_go_along_the_best_edges(d):
     torch.testing.assert_close(spanning_poses(edges, 6).matrix, world.matrix, rtol=0, atol=1e-12)
 
 
+def test_of_two_edges_of_one_pair_the_better_one_counts():
+    world = _circle(3, 2)
+    edges = _edges(world, [(0, 1), (0, 1), (1, 2), (1, 2)])
+    wrong = edges.target_from_source.translation.clone()
+    wrong[[0, 3]] += 3.0
+    score = torch.tensor([0.2, 0.9, 0.9, 0.2], dtype=torch.float64)
+    edges = edges._replace(target_from_source=RigidMotion(edges.target_from_source.rotation, wrong), score=score)
+    torch.testing.assert_close(spanning_poses(edges, 3).matrix, world.matrix, rtol=0, atol=1e-12)
+
+
 def _room(scans: int, rays: int = 180) -> ScanSet:
     """Scans of an L-shaped room by a sensor that walks and turns, exact ranges."""
     corners = np.array([[0, 0], [8, 0], [8, 3], [5, 3], [5, 7], [0, 7]], dtype=float)
@@ -132,3 +144,47 @@ def test_scans_are_thinned_evenly_and_padded():
     assert prepared.mask.sum(1)[0] == 40 and 60 < prepared.mask.sum(1)[1] <= 100
     assert torch.equal(prepared.points[0, :40], torch.from_numpy(scans.points[0][:40]).float())
     torch.testing.assert_close(prepared.normals[prepared.mask].norm(dim=-1), torch.ones(int(prepared.mask.sum())))
+
+
+def test_a_poor_neighbour_is_sought_again_from_turned_starts(monkeypatch):
+    scans = _room(5)
+    c, s = np.cos(np.deg2rad(75)), np.sin(np.deg2rad(75))
+    start = scans.truth.copy()
+    start[4, :2, :2] = start[4, :2, :2] @ np.array([[c, -s], [s, c]])
+    given = ScanSet(scans.points, scans.names, scans.timestamps, start, scans.truth)
+    scene, wanted = build_scene(scans, prepare(scans, 180)), np.linalg.inv(scans.truth[3]) @ scans.truth[4]
+    monkeypatch.setattr("train.chain.UNLIKE", np.inf)  # or its neighbours' motion would save it
+    for poor, saved in ((POOR, True), (-1.0, False)):
+        monkeypatch.setattr("train.chain.POOR", poor)
+        found = consecutive(scene, given, silent)
+        last = found.kept(found.source == 4).target_from_source.matrix[0].numpy()
+        assert (np.abs(last - wanted).max() < 0.02) == saved
+
+
+def test_an_edge_that_the_graph_does_not_believe_is_registered_anew():
+    scans = _room(4)
+    scene, truth = build_scene(scans, prepare(scans, 180)), RigidMotion.from_matrix(torch.from_numpy(scans.truth))
+    edges = _edges(truth, [(0, 1), (1, 2), (2, 3)])
+    wrong = edges.target_from_source.translation.clone()
+    wrong[1] += 0.5
+    edges = edges._replace(target_from_source=RigidMotion(edges.target_from_source.rotation, wrong))
+    edges = edges._replace(score=torch.tensor([0.9, 0.0, 0.9], dtype=torch.float64))
+    again = _again(scene, edges, torch.tensor([1.0, 0.0, 1.0]).double(), truth, None)
+    wanted = truth.item(1).inverse() @ truth.item(2)
+    assert (again.target_from_source.translation[1] - wanted.translation).norm() < 0.02
+    assert again.source.tolist() == [1, 2, 3] and again.score[1] > 0.5
+
+
+def test_a_loop_that_the_graph_does_not_believe_is_dropped(monkeypatch):
+    scans, asked = _room(8), []
+
+    def one_wrong_loop(scene, poses, edges, *rest, weights):
+        asked.append(int((edges.kind == 2).sum()))
+        loop = _edges(poses, [(0, 7)])
+        away = RigidMotion(loop.target_from_source.rotation, loop.target_from_source.translation + 3.0)
+        return loop._replace(target_from_source=away) if len(asked) == 1 else edges.kept(edges.kind < 0)
+
+    monkeypatch.setattr("train.edges._loops", one_wrong_loop)
+    edges, poses = register_edges(scans, EdgeConfig(window=2, points=180, rounds=2))
+    assert asked == [0, 0] and not (edges.kind == 2).any()
+    assert np.abs(poses.matrix.numpy() - scans.truth).max() < 0.02

@@ -4,10 +4,14 @@ import numpy as np
 import torch
 from small_worlds import true_edges
 
-from bbr_layer import read_cloud
+from bbr_layer import RigidMotion, read_cloud
+from train.free_space_evidence import range_views
 from train.moving_points import MovingPoints
 from train.outputs import MapResult, write_outputs
+from train.prepared import prepare
 from train.scans import ScanSet
+from train.scene import build_scene, scores
+from train.surfaces import surfaces
 
 WALL, RAYS, SCANS = 2.0, 360, 6
 ANGLES = np.linspace(0, 2 * np.pi, RAYS, endpoint=False) + 1e-3
@@ -46,20 +50,57 @@ def test_a_standing_column_has_not_moved():
     assert column.sum() > 50 and moving.moved.mean() < 0.02
 
 
+def test_a_ray_sees_through_what_stands_well_before_its_end():
+    scans = _hall(walks=False)[0]
+    points, view = scans.points[0], range_views(scans, surfaces(prepare(scans, RAYS)))[0]
+    assert view is not None
+    seen = [view.saw_through(share * points).mean() for share in (0.5, 0.97, 1.03, 1.5)]
+    assert seen[0] > 0.9 and max(seen[1:]) == 0
+    assert not view.saw_through(points * 0.5 + 1e3).any()  # where no ray went
+
+
+def test_a_witness_either_found_a_point_or_saw_through_it():
+    scans, column = _hall(walks=False)
+    edges = true_edges(scans)
+    moving = MovingPoints(scans, edges, scans.truth)
+    partners = np.bincount(torch.cat((edges.target, edges.source)).numpy(), minlength=SCANS)
+    assert (moving.found + moving.seen_through <= np.repeat(partners, RAYS)).all()
+    assert moving.found[column].sum() > 0
+
+
+def test_contradictions_weigh_against_a_motion(monkeypatch):
+    scans, _ = _hall(walks=False)
+    scene = build_scene(scans, prepare(scans, RAYS))
+    pairs = torch.tensor([0]), torch.tensor([3])
+    truth = RigidMotion.from_matrix(torch.from_numpy(scans.truth[3:4]))
+    wrong = RigidMotion(truth.rotation, truth.translation + torch.tensor([0.8, 0.0]))
+    right, off = (scores(scene, pairs, motion) for motion in (truth, wrong))
+    monkeypatch.setattr("train.scene.CONTRADICTION", 0.0)
+    right_alone, off_alone = (scores(scene, pairs, motion) for motion in (truth, wrong))
+    assert right > off
+    assert off < 0.8 * off_alone and right > 0.9 * right_alone
+
+
 def test_without_edges_nobody_bears_witness():
     scans, _ = _hall(walks=True)
     assert not MovingPoints(scans, None, scans.truth).moved.any()
 
 
 def test_what_moved_leaves_the_map(tmp_path, monkeypatch):
-    monkeypatch.setattr("train.outputs._pictures", lambda *told: {})
-    monkeypatch.setattr("train.outputs.write_browser_map", lambda *told, names: None)
+    given = {}
+    monkeypatch.setattr(
+        "train.outputs._pictures", lambda result, points, grid: given.update(pictures=len(points)) or {}
+    )
+    monkeypatch.setattr(
+        "train.outputs.write_browser_map", lambda path, points, *told, names: given.update(browser=len(points))
+    )
     scans, column = _hall(walks=True)
     edges = true_edges(scans)
     metrics = write_outputs(tmp_path, MapResult(scans, scans.truth, edges))
     still, moved = read_cloud(tmp_path / "map.ply"), read_cloud(tmp_path / "movers.ply")
     assert len(still.points) + len(moved.points) == len(column)
     assert len(moved.points) == metrics["moving_points"] > 0.9 * column.sum()
+    assert given["pictures"] == given["browser"] == len(still.points)
     write_outputs(
         tmp_path, MapResult(_hall(walks=False)[0], scans.truth, edges._replace(score=torch.zeros(len(edges.score))))
     )

@@ -9,9 +9,10 @@ import torch
 from problems import motion, noisy_pair, unit
 from torch import Tensor
 
-from bbr_layer import Adam, BBRLayer, Detached, RigidMotion, estimate_normals, margins
+from bbr_layer import Adam, BBRLayer, CloudPair, Detached, RigidMotion, estimate_normals, margins
 from bbr_layer.neighbourhoods import nearest_neighbours
 from bbr_layer.neighbours import MutualNeighbours, nearest_by_tiles
+from bbr_layer.searches import search_of
 from bbr_layer.spacing import SPACING_POINTS, point_spacing
 
 
@@ -261,3 +262,17 @@ def test_spacing_of_a_large_cloud_is_measured_on_some_points_against_all():
     padded = torch.cat((points, torch.full((500, 2), torch.nan)))[None]
     mask = (torch.arange(10_500) < 10_000)[None]
     assert torch.equal(point_spacing(padded, mask)[0], spacing)
+
+
+def test_a_cloud_that_is_written_to_is_searched_anew():
+    P, Q = (torch.rand(1, 40, 3, dtype=torch.float64) for _ in range(2))
+    still = RigidMotion.identity(3, (1,))
+    pair, normals = CloudPair(P, Q), estimate_normals(P)
+    before = search_of(pair)(still)[0]
+    assert search_of(pair) is search_of(CloudPair(P, Q))
+    P.copy_(torch.rand_like(P))
+    after = search_of(pair)(still)[0]
+    assert torch.equal(after, by_brute_force((P, Q, None, None), still)[0]) and not torch.equal(after, before)
+    assert torch.equal(estimate_normals(P), estimate_normals(P.clone())) and not torch.equal(
+        estimate_normals(P), normals
+    )

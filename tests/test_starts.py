@@ -51,6 +51,13 @@ def test_only_other_starts_begin_hotter():
     assert easy.stage.temperature.start == named_stage("softBBS").temperature.start
 
 
+def test_the_chosen_stage_sees_as_few_points_as_it_was_to():
+    P, Q, _ = _turned(3, 90, 1)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    stage = named_stage("softBBS", points=50)
+    assert best_start(7, stage, (pair, frame), RigidMotion.identity(3, (1,))).stage.points == 50
+
+
 def test_every_item_keeps_its_own_best():
     pairs = [_turned(3, 90, seed) for seed in (1, 2)]
     P, Q, truths = zip(*pairs, strict=True)

@@ -13,7 +13,10 @@ from bbr_layer.confidence import COEFFICIENTS
 from bbr_layer.preparation import prepared
 from bbr_layer.registration import StageResult, judged
 from benchmarks.reliability import fitted, loaded
+from benchmarks.reliability_runs import read, row
+from benchmarks.reliability_trials import trials
 
+TABLE = Path(__file__).resolve().parent.parent / "benchmarks" / "reliability.csv"
 N = 500
 # The pose is already right: the last stage only, and few steps of it.
 LAYER = BBRLayer("F", inner=Adam(10, 0.001), backward=Detached())
@@ -151,6 +154,13 @@ def test_many_points_are_judged_by_the_same_few_each_time(rng):
 
 
 def test_the_coefficients_are_what_the_table_gives():
-    table = Path(__file__).resolve().parent.parent / "benchmarks" / "reliability.csv"
-    _, right, shares, _ = loaded(table)
+    _, right, shares, _ = loaded(TABLE)
     np.testing.assert_allclose(fitted(shares, right), COEFFICIENTS, atol=0.05)
+
+
+def test_the_table_is_what_its_command_gives(real_data):
+    rows = read(TABLE)
+    layer = BBRLayer(backward=Detached())
+    for trial in [trial for trial in trials(4) if trial.points == 200][::16]:
+        kept, found = rows[trial.name, "default"], row(trial, "default", layer)
+        np.testing.assert_allclose(np.array(found[5:8], float), np.array(kept[5:8], float), atol=1e-3)
