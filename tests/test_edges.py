@@ -7,7 +7,7 @@ import torch
 from bbr_layer import RigidMotion, angular_error
 from train.chain import POOR, consecutive
 from train.config import EdgeConfig
-from train.edges import _again, register_edges
+from train.edges import DOUBTED, _again, register_edges
 from train.pose_graph import Edges, solve_pose_graph, spanning_poses
 from train.prepared import prepare
 from train.scans import ScanSet, silent
@@ -176,7 +176,7 @@ def test_an_edge_that_the_graph_does_not_believe_is_registered_anew():
 
 
 def test_a_loop_that_the_graph_does_not_believe_is_dropped(monkeypatch):
-    scans, asked = _room(8), []
+    scans, asked, doubted = _room(8), [], []
 
     def one_wrong_loop(scene, poses, edges, *rest, weights):
         asked.append(int((edges.kind == 2).sum()))
@@ -184,7 +184,13 @@ def test_a_loop_that_the_graph_does_not_believe_is_dropped(monkeypatch):
         away = RigidMotion(loop.target_from_source.rotation, loop.target_from_source.translation + 3.0)
         return loop._replace(target_from_source=away) if len(asked) == 1 else edges.kept(edges.kind < 0)
 
+    def spied(scene, edges, belief, *rest):
+        doubted.append(int((belief < DOUBTED).sum()))
+        return _again(scene, edges, belief, *rest)
+
     monkeypatch.setattr("train.edges._loops", one_wrong_loop)
+    monkeypatch.setattr("train.edges._again", spied)
     edges, poses = register_edges(scans, EdgeConfig(window=2, points=180, rounds=2))
     assert asked == [0, 0] and not (edges.kind == 2).any()
+    assert doubted == [0, 1]  # the loop, in the second round
     assert np.abs(poses.matrix.numpy() - scans.truth).max() < 0.02
