@@ -13,7 +13,8 @@ from benchmarks.paper_methods import METHODS, Method
 from benchmarks.paper_results import Bench, Scores
 from train.drawing import ACCENT, INK, PAPER, QUIET, SECOND, new_figure, quiet_frame, save_picture
 
-OURS = {"BBRLayer()": (INK, 3.4), "BBRLayer.robust()": (ACCENT, 1.5)}  # colour and width: the second lies on the first
+# Colour and width: of two that end alike the wider one lies below.
+OURS = {"BBRLayer()": (INK, 3.4), "BBRLayer.fast()": ("#e07b00", 1.5), "BBRLayer.robust()": (ACCENT, 1.5)}
 VARIANTS = dict(zip(("softBBS", "softBD", "N", "F"), ("#c9a227", "#b9770e", "#7d5a9b", SECOND), strict=True))
 PEERS = ("#2a9d8f", "#8ab17d", "#457b9d", "#9c89b8", "#b56576", "#6c757d", "#d18f5b")
 MARKERS = "os^vDPX"

@@ -94,8 +94,8 @@ def main() -> None:
     torch.set_num_threads(1)
     lines = [
         f"Made by `python -m benchmarks.solvers --repeats {options.repeats}`: bunny, horse and dragon, 500 points, "
-        "shared, own normals; failures over 5 degrees / registrations and median error in degrees by turn; processor "
-        "milliseconds of one, one thread, forward only, mean of all.",
+        "none shared, own normals; failures over 5 degrees / registrations and median error in degrees by turn; "
+        "processor milliseconds of one, one thread, forward only, mean of all.",
         "",
         "| layer | " + " | ".join(f"{angle:g} deg: failures | median" for angle in ANGLES_DEG) + " | ms |",
         "|---|" + "---|---|" * len(ANGLES_DEG) + "---|",

@@ -123,16 +123,18 @@ def test_gradcheck(name, d):
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("name", NAMES)
 def test_replay_is_the_plain_unroll(name, masked):
-    given = {k: v for k, v in noisy_pair(3, batch=2).items() if "features" not in k}
+    given = {k: v for k, v in noisy_pair(3, batch=2, n=20, m=24).items() if "features" not in k}
     if masked:
-        given["P_mask"], given["Q_mask"] = torch.arange(7)[None] < torch.tensor([[6], [5]]), torch.rand(2, 9) > 0.2
+        given["P_mask"], given["Q_mask"] = torch.arange(20)[None] < torch.tensor([[19], [18]]), torch.rand(2, 24) > 0.2
     found = []
     for mode in (Replay(), Autograd(), Truncated(3)):
         leaves = {k: v.clone().requires_grad_() for k, v in given.items() if v.dtype == torch.float64}
         numbers = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in HOT]
         layer = BBRLayer(name, inner=GaussNewton(3), temperature=Annealed(*numbers), backward=mode)
-        matrix = layer(**{**given, **leaves}).target_from_source.matrix
-        gradients = torch.autograd.grad(matrix.square().sum(), [*leaves.values(), *numbers], allow_unused=True)
+        result = layer(**{**given, **leaves})
+        assert result.buddies.min() > 6, "six unknowns: with fewer pairs only the damping keeps F's equations regular"
+        total = result.target_from_source.matrix.square().sum()
+        gradients = torch.autograd.grad(total, [*leaves.values(), *numbers], allow_unused=True)
         found.append(torch.cat([torch.zeros(1) if g is None else g.flatten() for g in gradients]))
     for other in found[1:]:
         assert (found[0] - other).norm() <= 1e-10 * other.norm()
