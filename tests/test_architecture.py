@@ -84,8 +84,9 @@ ORDER = {
         shape_features refinement
         free_space_evidence
         scene moving_points
+        places
         pair_registration outputs
-        chain
+        chain recognition
         edges
         known_edges
         groups schedule

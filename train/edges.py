@@ -12,6 +12,7 @@ from train.free_space_evidence import point_evidence
 from train.pair_registration import PointWeights, better, register_pairs
 from train.pose_graph import Edges, solve_pose_graph, spanning_poses
 from train.prepared import Prepared, prepare, thinned
+from train.recognition import recognised
 from train.refinement import refine
 from train.scans import Progress, ScanSet, silent
 from train.scene import Scene, build_scene
@@ -51,6 +52,9 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
     poses, belief = solve_pose_graph(edges, _anchored(spanning_poses(edges, len(scans)), scans))
     if (steps := min(config.window, len(scans) - 1)) > 1:
         edges = edges.joined(_window(scene, poses, steps, progress))
+        poses, belief = solve_pose_graph(edges, poses)
+    if scans.dimension == 2 and broken and config.loops_per_scan:
+        edges = edges.joined(recognised(scene, edges, poses, LOOP_WINDOWS * max(config.window, 2), progress))
         poses, belief = solve_pose_graph(edges, poses)
     for _ in range(config.rounds if config.loops_per_scan else 0):
         weights = _point_weights(scene, edges, poses)
