@@ -64,10 +64,9 @@ def alike(scene: Scene, keys: Sequence[int], apart: int, progress: Progress = si
         before = int((numbers <= number - apart).sum())
         if before:
             turned = [torch.fft.rfft2(_turned(picture[key])) for picture in pictures[:2]]
-            # sum over the cells of target(cell + shift) * source(cell), for all shifts, both ways round
-            spectrum = likely[:before, None] * turned[0].conj() + hits[:before, None] * turned[1].conj()
-            best = torch.fft.irfft2(spectrum, s=(SIDE, SIDE)).flatten(1).max(dim=1)
-            found.append((numbers[:before], torch.full((before,), number), best.indices, best.values))
+            best = [_best_overlap((likely[one], hits[one]), turned) for one in range(before)]
+            score, place = (torch.stack(part) for part in zip(*best, strict=True))
+            found.append((numbers[:before], torch.full((before,), number), place, score))
     progress("places", len(keys), len(keys))
     if not found:
         none = torch.zeros(0, dtype=torch.int64)
@@ -75,6 +74,14 @@ def alike(scene: Scene, keys: Sequence[int], apart: int, progress: Progress = si
     target, source, place, score = (torch.cat(part) for part in zip(*found, strict=True))
     order = score.argsort(descending=True)
     return Likeness(target[order], source[order], _motions(place[order], pictures.cell), score[order].double())
+
+
+def _best_overlap(target: tuple[Tensor, Tensor], turned: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """The largest sum over all cells of ``target(cell + shift) * turned(cell)``, both ways round, and its flat place."""
+    expected, hit = target
+    spectrum = expected * turned[0].conj() + hit * turned[1].conj()
+    best = torch.fft.irfft2(spectrum, s=(SIDE, SIDE)).flatten().max(dim=0)
+    return best.values, best.indices
 
 
 def draw(scene: Scene, keys: Sequence[int]) -> Pictures:

@@ -1,0 +1,180 @@
+"""How many wrong loops does a map survive?
+
+    python -m benchmarks.false_loops [--only v1_pose0 ...] [--again] [--out benchmarks/false_loops.md]
+
+The edges of a sequence are registered once; then wrong loops are added until they are the given share of all edges
+beyond the chain, and the pose graph and the refinement are solved again. ``scattered``: between scans drawn at random,
+each with a motion of its own. ``agreeing``: in groups of four between neighbouring scans, all of a group leading to
+the same wrong place along the chain, as rooms that look alike do. A wrong loop has the information, centre and score of
+a right edge. Motions: any turn (about the vertical axis), shifts as far as two scan radii.
+"""
+
+import argparse
+import json
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from bbr_layer import RigidMotion, atomic_write
+from benchmarks.mapping_rows import ROWS, Row
+from train.config import EdgeConfig
+from train.edges import register_edges
+from train.evaluate import evaluate_trajectory
+from train.free_space_evidence import point_evidence, range_views
+from train.pose_graph import Edges, solve_pose_graph
+from train.poses import embed_poses
+from train.prepared import prepare
+from train.refinement import refine
+from train.scans import ScanSet
+from train.surfaces import surfaces
+
+CHOSEN = ("v1_pose0, stride 2", "v1_pose0, noise 1 px", "v1_pose0, 180 deg", "balm 30-108, stride 1")
+SHARES, KINDS, SEEDS = (0.1, 0.3, 0.5), ("scattered", "agreeing"), 5
+GROUP = 4
+# Edges believed less than this do not take part in the refinement, as in the mapper.
+DOUBTED = 0.3
+
+
+class Solved(NamedTuple):
+    """The error of a map in its row's unit, and how many of the wrong loops were believed."""
+
+    error: float
+    believed: int
+
+
+def solved(row: Row, scans: ScanSet, edges: Edges, wrong: int) -> Solved:
+    """The map of these edges, of which the last ``wrong`` are wrong, from the poses of the chain and the window."""
+    sure = edges.kept(edges.kind < 2)
+    begin, _ = solve_pose_graph(sure, _along_the_chain(sure, len(scans)))
+    poses, belief = solve_pose_graph(edges, begin)
+    full = prepare(scans, EdgeConfig().refined_points)
+    clouds = surfaces(full)
+    pairs, found = torch.stack((edges.target, edges.source), 1).numpy(), poses.matrix.numpy()
+    evidence = point_evidence([cloud.points for cloud in clouds], (clouds, range_views(scans, clouds)), pairs, found)
+    trust = torch.where(belief > DOUBTED, belief, 0.0).numpy()
+    refined = refine(clouds, pairs, found, (trust, [one.weight for one in evidence]))
+    assert scans.truth is not None
+    errors = evaluate_trajectory(embed_poses(refined), embed_poses(scans.truth), None)
+    return Solved(errors["ape_rmse"] * row.unit.scale, int((belief[len(belief) - wrong :] > DOUBTED).sum()))
+
+
+def _along_the_chain(edges: Edges, scans: int) -> RigidMotion:
+    chain = edges.kept(edges.kind == 0).target_from_source
+    poses = [RigidMotion.identity(chain.dimension)]
+    for edge in range(scans - 1):
+        poses.append(poses[-1] @ chain.item(edge))
+    return RigidMotion(*(torch.stack(field) for field in zip(*poses, strict=True)))
+
+
+class Wrong(NamedTuple):
+    """Which wrong loops: ``share`` of all edges beyond the chain, ``kind``, and the seed they are drawn from."""
+
+    share: float
+    kind: str
+    seed: int
+
+
+def wrong_loops(edges: Edges, poses: RigidMotion, reach: float, wrong: Wrong) -> Edges:
+    """Wrong loops between the scans of ``poses``, each like a right edge drawn at random but for where it leads.
+
+    ``reach``: radius of a scan, in the data's unit.
+    """
+    random = np.random.default_rng(wrong.seed)
+    right = np.flatnonzero(edges.kind.numpy() > 0)
+    count = round(wrong.share / (1 - wrong.share) * len(right))
+    drawn: list[tuple[int, int, RigidMotion]] = []
+    while len(drawn) < count:
+        drawn += _group(poses, reach, GROUP if wrong.kind == "agreeing" else 1, random)
+    target, source, motions = zip(*drawn[:count], strict=True)
+    return edges.kept(torch.from_numpy(random.choice(right, size=count)))._replace(
+        target=torch.tensor(target),
+        source=torch.tensor(source),
+        target_from_source=RigidMotion(*(torch.stack(field) for field in zip(*motions, strict=True))),
+        kind=torch.full((count,), 2),
+    )
+
+
+def _group(
+    poses: RigidMotion, reach: float, size: int, random: np.random.Generator
+) -> list[tuple[int, int, RigidMotion]]:
+    """``size`` wrong loops between neighbouring scans that agree with each other along the poses."""
+    k, d = len(poses.translation), poses.dimension
+    i, j = np.sort(random.choice(k - size + 1, size=2, replace=False)).tolist()
+    turn = torch.zeros(1 if d == 2 else 3, dtype=torch.float64)
+    turn[-1] = random.uniform(-np.pi, np.pi)
+    shift = torch.from_numpy(random.uniform(-2 * reach, 2 * reach, size=d))
+    wrong = RigidMotion.from_rotvec(turn, shift)
+    steps = range(size)
+    to_target = [poses.item(i + step).inverse() @ poses.item(i) for step in steps]
+    from_source = [poses.item(j).inverse() @ poses.item(j + step) for step in steps]
+    return [(i + step, j + step, to_target[step] @ wrong @ from_source[step]) for step in steps]
+
+
+def measured(row: Row) -> dict[str, list[list[float]]]:
+    """By share and kind, ``[error, wrong loops believed, wrong loops]`` of every seed; by ``"0"`` without any."""
+    scans = row.make()
+    edges, poses = register_edges(scans, EdgeConfig(), lambda *told: print("\r", *told, end="   ", flush=True))
+    reach = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in scans.points]))
+    results = {"0": [[solved(row, scans, edges, 0).error, 0.0, 0.0]]}
+    for share, kind, seed in product(SHARES, KINDS, range(SEEDS)):
+        print(f"\r{share} {kind} {seed}", end="      ", flush=True)
+        more = wrong_loops(edges, poses, reach, Wrong(share, kind, seed))
+        found = solved(row, scans, edges.joined(more), len(more.target))
+        results.setdefault(f"{share} {kind}", []).append([found.error, found.believed, len(more.target)])
+    return results
+
+
+def table(results: dict[str, dict[str, list[list[float]]]]) -> str:
+    """One row per sequence, share and kind."""
+    lines = [
+        "Made by `python -m benchmarks.false_loops`: wrong loops added to the registered edges until they are the",
+        "share of all edges beyond the chain; the pose graph and the refinement solved again. Errors: median and worst of",
+        f"{SEEDS} seeds over the error without wrong loops; believed: wrong loops that were, of all seeds together.",
+        "",
+        "| sequence | wrong loops | of all | error without | median | worst | believed |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, found in results.items():
+        (without, *_), unit = found["0"][0], ROWS[name].unit.name
+        for key, seeds in found.items():
+            if key == "0":
+                continue
+            share, kind = key.split()
+            ratios = [error / without for error, *_ in seeds]
+            believed, count = (int(sum(seed[part] for seed in seeds)) for part in (1, 2))
+            cells = (
+                f"{float(share):.0%}",
+                f"{without:.3g} {unit}",
+                f"{np.median(ratios):.3f} x",
+                f"{max(ratios):.3f} x",
+            )
+            lines.append(f"| {name} | {kind} | {' | '.join(cells)} | {believed} of {count} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure the rows asked for and write the table after each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", default=[""], help="rows that begin with one of these")
+    parser.add_argument("--again", action="store_true", help="measure rows again that are there")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks", "false_loops.md"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    kept = Path("out", "benchmark", f"{options.out.stem}.json")
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    results = json.loads(kept.read_text()) if kept.exists() else {}
+    for name in CHOSEN:
+        if not name.startswith(tuple(options.only)) or (name in results and not options.again):
+            continue
+        results[name] = measured(ROWS[name])
+        for path, text in ((kept, json.dumps(results, indent=1)), (options.out, table(results))):
+            with atomic_write(path) as temporary:
+                temporary.write_text(text)
+    print("\n" + table(results))
+
+
+if __name__ == "__main__":
+    main()
