@@ -131,8 +131,8 @@ def table(results: dict[str, dict[str, list[list[float]]]]) -> str:
     """One row per sequence, share and kind."""
     lines = [
         "Made by `python -m benchmarks.false_loops`: wrong loops added to the registered edges until they are the",
-        "share of all edges beyond the chain; the pose graph and the refinement solved again. Errors: median and worst of",
-        f"{SEEDS} seeds over the error without wrong loops; believed: wrong loops that were, of all seeds together.",
+        "share of all edges beyond the chain; the pose graph and the refinement solved again. Errors: median and",
+        f"worst of {SEEDS} seeds over the error without wrong loops; believed: wrong loops that were, of all seeds.",
         "",
         "| sequence | wrong loops | of all | error without | median | worst | believed |",
         "|---|---|---|---|---|---|---|",

@@ -86,7 +86,7 @@ ORDER = {
         scene moving_points
         places
         pair_registration outputs
-        chain recognition
+        chain recognition given_motion loops
         edges
         known_edges
         groups schedule

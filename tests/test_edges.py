@@ -7,7 +7,8 @@ import torch
 from bbr_layer import RigidMotion, angular_error
 from train.chain import POOR, consecutive
 from train.config import EdgeConfig
-from train.edges import DOUBTED, _again, register_edges
+from train.edges import register_edges
+from train.loops import DOUBTED, again
 from train.pose_graph import Edges, solve_pose_graph, spanning_poses
 from train.prepared import prepare
 from train.scans import ScanSet, silent
@@ -169,10 +170,10 @@ def test_an_edge_that_the_graph_does_not_believe_is_registered_anew():
     wrong[1] += 0.5
     edges = edges._replace(target_from_source=RigidMotion(edges.target_from_source.rotation, wrong))
     edges = edges._replace(score=torch.tensor([0.9, 0.0, 0.9], dtype=torch.float64))
-    again = _again(scene, edges, torch.tensor([1.0, 0.0, 1.0]).double(), truth, None)
+    found = again(scene, edges, torch.tensor([1.0, 0.0, 1.0]).double(), truth, None)
     wanted = truth.item(1).inverse() @ truth.item(2)
-    assert (again.target_from_source.translation[1] - wanted.translation).norm() < 0.02
-    assert again.source.tolist() == [1, 2, 3] and again.score[1] > 0.5
+    assert (found.target_from_source.translation[1] - wanted.translation).norm() < 0.02
+    assert found.source.tolist() == [1, 2, 3] and found.score[1] > 0.5
 
 
 def test_a_loop_that_the_graph_does_not_believe_is_dropped(monkeypatch):
@@ -186,10 +187,10 @@ def test_a_loop_that_the_graph_does_not_believe_is_dropped(monkeypatch):
 
     def spied(scene, edges, belief, *rest):
         doubted.append(int((belief < DOUBTED).sum()))
-        return _again(scene, edges, belief, *rest)
+        return again(scene, edges, belief, *rest)
 
-    monkeypatch.setattr("train.edges._loops", one_wrong_loop)
-    monkeypatch.setattr("train.edges._again", spied)
+    monkeypatch.setattr("train.edges.loops", one_wrong_loop)
+    monkeypatch.setattr("train.edges.again", spied)
     edges, poses = register_edges(scans, EdgeConfig(window=2, points=180, rounds=2))
     assert asked == [0, 0] and not (edges.kind == 2).any()
     assert doubted == [0, 1]  # the loop, in the second round

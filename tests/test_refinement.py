@@ -67,3 +67,17 @@ def test_a_wrong_edge_without_trust_and_points_without_weight_do_not_pull():
     trust[EDGES[:, 1] == 4] = 0
     again = refine(scans, EDGES, start, (trust, _alike(scans)[1]))
     np.testing.assert_allclose(again, found, atol=1e-6)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_scans_that_no_edge_joins_to_the_first_stay_where_they_are_as_a_whole(d):
+    scans, truth = _box(d)
+    noise = np.random.default_rng(2)
+    for scan in scans:
+        scan.points[...] += 0.02 * noise.normal(size=scan.points.shape)
+    apart = np.array([(0, 1), (2, 3), (2, 4), (3, 4)])
+    found = refine(scans, apart, truth, (np.ones(len(apart)), [np.ones(len(scan.points)) for scan in scans]))
+    turned = np.linalg.inv(truth[2:, :d, :d]) @ found[2:, :d, :d]
+    common = (turned[:, 1, 0] - turned[:, 0, 1]).mean() / 2
+    assert abs(common) < 2e-3
+    assert np.abs((found - truth)[2:, :d, d].mean(axis=0)).max() < 5e-3

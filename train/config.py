@@ -36,7 +36,8 @@ class EdgeConfig(Settings):
     ----------
     window: each scan is registered with this many scans after it.
     loops_per_scan: most loop candidates of one scan, 0 for none.
-    rounds: how often loop candidates are sought again from the corrected poses, 0 for no loops.
+    rounds: how often loop candidates are sought from the corrected poses, and up to four times as often while scans
+        still move; 0 for no loops.
     points: most points of a scan that a registration reads.
     refined_points: most points of a scan that the last refinement of all poses reads.
     """

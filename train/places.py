@@ -77,7 +77,7 @@ def alike(scene: Scene, keys: Sequence[int], apart: int, progress: Progress = si
 
 
 def _best_overlap(target: tuple[Tensor, Tensor], turned: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """The largest sum over all cells of ``target(cell + shift) * turned(cell)``, both ways round, and its flat place."""
+    """The largest sum over all cells of ``target(cell + shift) * turned(cell)``, both ways round, and where it is."""
     expected, hit = target
     spectrum = expected * turned[0].conj() + hit * turned[1].conj()
     best = torch.fft.irfft2(spectrum, s=(SIDE, SIDE)).flatten().max(dim=0)

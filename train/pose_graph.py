@@ -42,7 +42,7 @@ class Edges(NamedTuple):
     information: ``(e, k, k)`` per pair of points, rotation before translation, about the carried ``centre``.
     centre: ``(e, d)`` centroid of the source scan, in its own frame.
     score: ``(e,)`` share of mutual pairs, in [0, 1].
-    kind: ``(e,)`` 0 consecutive scans, 1 within the window, 2 loop.
+    kind: ``(e,)`` 0 consecutive scans, 1 within the window, 2 loop; 3 a given motion, while edges are sought.
     """
 
     target: Tensor
@@ -113,6 +113,13 @@ def solve_pose_graph(edges: Edges, start: RigidMotion) -> tuple[RigidMotion, Ten
     return poses, weights
 
 
+def disagreement(motion: RigidMotion, edges: Edges) -> Tensor:
+    """Turn and displacement of the source's centre from each edge's motion to the one in ``motion``, ``(e, k)``."""
+    turn = RigidMotion(motion.rotation @ edges.target_from_source.rotation.mT, motion.translation).rotvec
+    shift = (motion(edges.centre[:, None]) - edges.target_from_source(edges.centre[:, None]))[:, 0]
+    return torch.cat((turn, shift), -1)
+
+
 def _graduation() -> list[float]:
     """Kernel widths, narrowing to 1 and staying there while the scale of the inliers settles."""
     rounds = math.ceil(math.log(START_WIDTH) / math.log(NARROWING))
@@ -129,11 +136,8 @@ def _information_root(edges: Edges) -> Tensor:
 
 def _residuals(edges: Edges, poses: RigidMotion, root: Tensor) -> Tensor:
     """Whitened disagreement of each edge: turn, and displacement of the source's centre, ``(e, k)``."""
-    target, source = poses.item(edges.target), poses.item(edges.source)
-    predicted = target.inverse() @ source
-    turn = RigidMotion(predicted.rotation @ edges.target_from_source.rotation.mT, predicted.translation).rotvec
-    shift = (predicted(edges.centre[:, None]) - edges.target_from_source(edges.centre[:, None]))[:, 0]
-    return (root.mT @ torch.cat((turn, shift), -1)[..., None])[..., 0]
+    apart = disagreement(poses.item(edges.target).inverse() @ poses.item(edges.source), edges)
+    return (root.mT @ apart[..., None])[..., 0]
 
 
 def _jacobians(edges: Edges, poses: RigidMotion) -> tuple[Tensor, Tensor]:

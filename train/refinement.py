@@ -115,9 +115,9 @@ def _gauss_newton(
         apart = (offset**2).sum(axis=1) / (APART * spacing) ** 2
         weight = belief / ((1 + (off_plane / (width * spacing)) ** 2) * (1 + apart)) ** 2
         weight = weight * of_points[target][pairs.target_index] * of_points[source][pairs.source_index]
-        levers = [
-            placed - poses[number, :-1, -1] for placed, number in ((pairs.target, target), (pairs.source, source))
-        ]
+        # one arm for both scans: the plane turns with them, so that a turn of the two together changes nothing
+        middle = (pairs.target + pairs.source) / 2
+        levers = [middle - poses[number, :-1, -1] for number in (target, source)]
         jacobian = np.concatenate((-_jacobian(levers[0], pairs.plane), _jacobian(levers[1], pairs.plane)), axis=1)
         weighted = jacobian * weight[:, None]
         blocks.append(weighted.T @ jacobian)
