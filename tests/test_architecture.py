@@ -82,7 +82,7 @@ ORDER = {
         prepared pose_graph consensus
         surfaces edge_files report run_folder
         shape_features refinement
-        free_space_evidence
+        free_space_evidence planes
         scene moving_points
         places
         pair_registration outputs
@@ -92,6 +92,7 @@ ORDER = {
         groups schedule
         data_module
         alignment mapping_module
+        surface_map
         keep_best
         training
         mapping

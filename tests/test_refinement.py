@@ -22,13 +22,13 @@ def _box(d, unit=1.0):
     poses = RigidMotion.from_rotvec(turns, places)
     clouds = []
     for scan in range(SCANS):
-        points = random.uniform(0, 1, size=(250 * d, d))
+        points = random.uniform(0, 1, size=(500 * (d - 1) ** 2, d))
         axis = np.arange(len(points)) % d
         points[np.arange(len(points)), axis] = points[np.arange(len(points)), axis] > 0.5
         world = torch.from_numpy(unit * SIDES[:d] * points)
         clouds.append(poses.item(scan).inverse()(world).numpy())
     scans = ScanSet(clouds, [str(i) for i in range(SCANS)], np.arange(SCANS, dtype=float))
-    return surfaces(prepare(scans, 1000)), poses.matrix.numpy()
+    return surfaces(prepare(scans, 2000)), poses.matrix.numpy()
 
 
 def _shaken(poses, metres):

@@ -1,11 +1,12 @@
 """The poses that align the scans best, the starting ones included: what the training is allowed to answer."""
 
 import copy
+from collections.abc import Callable
 
 import lightning as L
 from torch import Tensor
 
-from train.alignment import Alignment
+from bbr_layer import RigidMotion
 from train.data_module import MappingData
 from train.mapping_module import MappingModule
 from train.scans import Progress
@@ -29,7 +30,7 @@ class KeepBest(L.Callback):
     data: what poses are read from.
     """
 
-    def __init__(self, alignment: Alignment, data: MappingData):
+    def __init__(self, alignment: Callable[[RigidMotion], float], data: MappingData):
         self.alignment, self.data = alignment, data
         self.kept_epoch = 0
         self.kept: dict[str, Tensor] | None = None

@@ -8,9 +8,9 @@ from torch import Tensor
 from bbr_layer import estimate_normals, evenly_thinned
 from train.scans import ScanSet
 
-# Normals are fitted to this many neighbours of the full scan before it is thinned: a line in 2D. In 3D 13, the paper's for
-# a surface, reach along one ring of a lidar and not to the next (the paper takes 94 there); 30 bring kitti00, kitti07
-# and tum of benchmarks/mapping_table.md nearer and take nothing from the others.
+# Normals are fitted to this many neighbours of the full scan before it is thinned: a line in 2D. In 3D 13, the paper's
+# for a surface, reach along one ring of a lidar and not to the next (the paper takes 94 there); with 30 kitti00 and
+# tum of benchmarks/mapping_table.md come nearer.
 NORMAL_NEIGHBOURS = {2: 6, 3: 30}
 
 

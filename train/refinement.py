@@ -67,7 +67,7 @@ def refine(
         progress("refinement", step, STEPS)
         found = [mutual_pairs(scans, edge, poses) for edge in edges]
         moves, median = _gauss_newton(scans, (edges, found), poses, (trust, weights[1], width))
-        poses = _moved(poses, moves)
+        poses = moved(poses, moves)
         turned, shifted = (np.linalg.norm(part, axis=1) for part in (moves[:, :-d], moves[:, -d:]))
         settled = np.max(turned * reach + shifted) < SETTLED * spacing
         final = max(FINAL_WIDTH[d] * median, FINEST_WIDTH)
@@ -119,9 +119,9 @@ def _gauss_newton(
         # one arm for both scans: the plane turns with them, so that a turn of the two together changes nothing
         middle = (pairs.target + pairs.source) / 2
         levers = [middle - poses[number, :-1, -1] for number in (target, source)]
-        jacobian = np.concatenate((-_jacobian(levers[0], pairs.plane), _jacobian(levers[1], pairs.plane)), axis=1)
-        weighted = jacobian * weight[:, None]
-        blocks.append(weighted.T @ jacobian)
+        both = np.concatenate((-jacobian(levers[0], pairs.plane), jacobian(levers[1], pairs.plane)), axis=1)
+        weighted = both * weight[:, None]
+        blocks.append(weighted.T @ both)
         pull = weighted.T @ off_plane
         forces[target] += pull[:size]
         forces[source] += pull[size:]
@@ -129,7 +129,7 @@ def _gauss_newton(
     return _solved(edges, np.array(blocks), forces), float(np.median(np.concatenate(distances)))
 
 
-def _jacobian(arms: Float[np.ndarray, "n d"], planes: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n size"]:
+def jacobian(arms: Float[np.ndarray, "n d"], planes: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n size"]:
     """d(plane . moved point) / d(turn, shift)."""
     turn = np.cross(arms, planes) if arms.shape[1] == 3 else arms[:, 0] * planes[:, 1] - arms[:, 1] * planes[:, 0]
     return np.column_stack((turn, planes))
@@ -149,11 +149,12 @@ def _solved(
     return np.concatenate((np.zeros(size), step)).reshape(k, size)
 
 
-def _moved(poses: Float[np.ndarray, "k d1 d1"], moves: Float[np.ndarray, "k size"]) -> Float[np.ndarray, "k d1 d1"]:
+def moved(poses: Float[np.ndarray, "k d1 d1"], moves: Float[np.ndarray, "k size"]) -> Float[np.ndarray, "k d1 d1"]:
+    """The poses, all but the first turned about their own places and shifted by ``moves``, turn before shift."""
     d = poses.shape[1] - 1
     turns = np.zeros((len(poses), 3))
     turns[:, 3 - (moves.shape[1] - d) :] = moves[:, :-d]  # in the plane a turn about z
-    moved = poses.copy()
-    moved[1:, :d, :d] = Rotation.from_rotvec(turns[1:]).as_matrix()[:, :d, :d] @ poses[1:, :d, :d]
-    moved[:, :d, d] += moves[:, -d:]
-    return moved
+    found = poses.copy()
+    found[1:, :d, :d] = Rotation.from_rotvec(turns[1:]).as_matrix()[:, :d, :d] @ poses[1:, :d, :d]
+    found[:, :d, d] += moves[:, -d:]
+    return found

@@ -16,6 +16,7 @@ from train.keep_best import KeepBest, ReportProgress
 from train.mapping_module import MappingModule, build_module
 from train.pose_graph import Edges
 from train.scans import Progress, ScanSet, silent
+from train.surface_map import MapScore, SurfaceMap
 
 # The file in the folder of checkpoints that a killed run goes on from.
 LAST = "last.ckpt"
@@ -31,7 +32,7 @@ class Trained:
     world_from_scan: ``(k, ...)`` of the epoch that was kept.
     module: its M-Net knows the map of these poses.
     curves: per epoch: "total", "occupancy", "registration"; and "alignment", which begins with the starting map.
-    kept_epoch: 0 is the starting map.
+    kept_epoch: 0 is the starting map, adjusted or not.
     """
 
     world_from_scan: RigidMotion
@@ -63,7 +64,10 @@ def train_map(
     """
     data = MappingData(scans, edges, start, config=config.training, seed=config.seed)
     module = build_module(data, config.training, seed=config.seed)
-    best = KeepBest(Alignment(data.prepared, edges), data)
+    score = MapScore(Alignment(data.prepared, edges), SurfaceMap(scans, data.prepared, start.matrix.double().numpy()))
+    if config.training.adjust and config.training.epochs:
+        data.start = score.adjusted(data.start)
+    best = KeepBest(score, data)
     if config.training.epochs:
         trainer = L.Trainer(
             accelerator=config.device,

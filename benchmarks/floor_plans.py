@@ -1,0 +1,146 @@
+"""Does training bring the trajectory nearer to the truth than the registered edges alone, on simulated floor plans?
+
+    python -m benchmarks.floor_plans [--seeds 20] [--compared 5] [--out benchmarks/floor_plans.md]
+
+Every seed is another building and another walk: 48 scans of 180 rays, no starting poses, the default configuration but
+for 10 epochs; the truth is read for the errors alone. The seeds begin at 100: none was looked at while the mapper was
+made. All seeds are trained with ``residual``; the first few, with noise and movers, with every term, with and without
+the adjustment of the poses to the map of all scans. What ``out/benchmark/floor_plans.json`` already holds is not
+measured again.
+"""
+
+import argparse
+import json
+import logging
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from bbr_layer import RigidMotion, atomic_write
+from train.config import EdgeConfig, MapConfig, TrainingConfig
+from train.edges import register_edges
+from train.evaluate import evaluate_trajectory
+from train.poses import embed_poses
+from train.scans import ScanSet
+from train.simulate import WorldSettings, simulate
+from train.training import train_map
+
+SCANS, RAYS, EPOCHS, FIRST_SEED = 48, 180, 10, 100
+# Standard deviation of the ranges in metres, and people and trolleys.
+CONDITIONS = {"noise": (0.03, 0), "movers": (0.01, 6), "noise and movers": (0.03, 6)}
+MAIN, COMPARED_IN = "residual", "noise and movers"
+TERMS = ("residual", "F", "softBD", "none", "chamfer", "trimmed_chamfer", "geman_mcclure_chamfer")
+EDGES = "edges alone"
+# Millimetres of a metre.
+MM = 1000.0
+Found = dict[str, dict[str, float]]
+
+
+class Way(NamedTuple):
+    """A registration term, and whether the poses are first adjusted to the map of all scans."""
+
+    term: str
+    adjust: bool = True
+
+    @property
+    def name(self) -> str:
+        return self.term if self.adjust else f"{self.term}, not adjusted"
+
+
+def floor_plan(condition: str, seed: int) -> ScanSet:
+    """Planar scans in metres with their true poses, the first at the origin."""
+    noise, movers = CONDITIONS[condition]
+    world = simulate(WorldSettings(scans=SCANS, beams=RAYS, noise_m=noise, movers=movers, seed=seed))
+    truth = world.world_from_scan[:, [0, 1, 3]][:, :, [0, 1, 3]]
+    names = [str(number) for number in range(SCANS)]
+    return ScanSet(world.points, names, world.timestamps, truth=np.linalg.inv(truth[0]) @ truth)
+
+
+def ate(poses: RigidMotion, scans: ScanSet) -> float:
+    """RMSE of the positions after rigid alignment, millimetres."""
+    return evaluate_trajectory(embed_poses(poses.matrix.numpy()), embed_poses(scans.truth))["ape_rmse"] * MM
+
+
+def measured(condition: str, seed: int, ways: list[Way]) -> Iterator[tuple[str, dict[str, float]]]:
+    """Error and CPU seconds of the edges alone, then of each way of training."""
+    scans = floor_plan(condition, seed)
+    begin = time.process_time()
+    edges, start = register_edges(scans, EdgeConfig())
+    yield EDGES, {"ate": ate(start, scans), "cpu": time.process_time() - begin}
+    for way in ways:
+        begin = time.process_time()
+        training = TrainingConfig(term=way.term, adjust=way.adjust, epochs=EPOCHS)
+        trained = train_map(scans, edges, start, MapConfig(training=training))
+        found = {"ate": ate(trained.world_from_scan, scans), "cpu": time.process_time() - begin}
+        yield way.name, found | {"kept": trained.kept_epoch}
+
+
+def rows(results: dict[str, Found], condition: str, names: list[str]) -> Iterator[str]:
+    """One row for each way that was measured: medians over the seeds that have it."""
+    for name in names:
+        seeds = [found for key, found in results.items() if key.startswith(f"{condition}, ") and name in found]
+        if not seeds:
+            continue
+        ates = [found[name]["ate"] for found in seeds]
+        ratios = [found[name]["ate"] / found[EDGES]["ate"] for found in seeds]
+        reached = median(ates) / median(found[EDGES]["ate"] for found in seeds)
+        cpu = median(found[name]["cpu"] for found in seeds)
+        worse = sum(ratio > 1 for ratio in ratios)
+        yield (
+            f"| {condition} | {name} | {len(seeds)} | {median(ates):.1f} | {reached:.2f} | {median(ratios):.2f} "
+            f"| {max(ratios):.2f} | {worse} | {cpu:.1f} |"
+        )
+
+
+def table(results: dict[str, Found]) -> str:
+    """The whole text."""
+    head = (
+        f"Made by `python -m benchmarks.floor_plans`, one thread: {SCANS} scans of {RAYS} rays, {EPOCHS} epochs, else\n"
+        "the default configuration. Noise: 30 mm (10 mm with movers alone); movers: 6. ATE: RMSE of the positions\n"
+        "after rigid alignment, mm, median over the seeds; ratio: to the edges alone, of the medians, then the median\n"
+        "and the largest of the seeds' own; worse: seeds that ended farther off; CPU seconds: of that step.\n"
+    )
+    titles = "| condition | way | seeds | ATE, mm | ratio | seeds' ratio | largest | worse | CPU seconds |"
+    lines = [head, titles, "|---" * 9 + "|"]
+    for condition in CONDITIONS:
+        lines += rows(results, condition, [EDGES, MAIN])
+    compared = {key: found for key, found in results.items() if len(found) > 2}
+    lines += ["", f"The same budget for every term, {COMPARED_IN}:", "", titles, "|---" * 9 + "|"]
+    lines += rows(compared, COMPARED_IN, [EDGES, *(Way(term, kind).name for kind in (True, False) for term in TERMS)])
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure what is missing and write the table after each measurement."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--compared", type=int, default=5, help="seeds that are trained with every term")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks", "floor_plans.md"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    kept = Path("out", "benchmark", f"{options.out.stem}.json")
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Found] = json.loads(kept.read_text()) if kept.exists() else {}
+    jobs = [(c, FIRST_SEED + n, [Way(MAIN)]) for n in range(options.seeds) for c in CONDITIONS]
+    every = [Way(term, adjust) for adjust in (False, True) for term in TERMS]
+    jobs += [(COMPARED_IN, FIRST_SEED + n, every) for n in range(options.compared)]
+    for number, (condition, seed, ways) in enumerate(jobs):
+        found = results.setdefault(f"{condition}, seed {seed}", {})
+        missing = [way for way in ways if way.name not in found]
+        for name, one in measured(condition, seed, missing) if missing else ():
+            found[name] = one
+            told = f"{number + 1}/{len(jobs)} {condition}, seed {seed}, {name}: {one['ate']:.1f} mm, {one['cpu']:.1f} s"
+            print(told, flush=True)
+            for path, text in ((kept, json.dumps(results, indent=1)), (options.out, table(results))):
+                with atomic_write(path) as temporary:
+                    temporary.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
