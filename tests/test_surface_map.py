@@ -65,6 +65,17 @@ def test_the_adjusted_poses_are_nearer_to_the_truth(d):
     assert error(found, scans.truth) < 0.25 * error(start, scans.truth)
 
 
+def test_a_scan_that_shares_no_surface_stays_where_it_is():
+    scans, away = room(2, noise=0.005), np.array([50.0, 0.0])
+    poses = np.concatenate((scans.truth, scans.truth[:1]))
+    poses[-1, :2, 2] = away
+    lonely = ScanSet([*scans.points, scans.points[3]], [*scans.names, "away"], np.arange(len(poses), dtype=float))
+    start = shaken(poses, 0.02)
+    found = surface_map(lonely, start).adjusted(start)
+    assert np.abs(found[-1] - start[-1]).max() < 1e-4
+    assert error(found[:-1], scans.truth) < 0.25 * error(start[:-1], scans.truth)
+
+
 def test_the_map_is_thicker_at_shaken_poses_and_where_scans_lie_alone():
     scans = room(2, noise=0.005)
     surfaces = surface_map(scans, scans.truth)

@@ -11,7 +11,7 @@ from train.refinement import jacobian
 
 # Fits of each plane: all but the first without what lies far off.
 FITS = 3
-# Added to the diagonal of the normal equations, as a share of it; and where nothing holds a pose.
+# Added to the diagonal of the normal equations, as a share of it; and to a plane's own where its points are one.
 DAMPING, TINY = 1e-6, 1e-300
 
 
@@ -88,10 +88,14 @@ def thinning_step(planes: Planes, here: Placed, poses: Float[np.ndarray, "k d1 d
     own = _blocks(planes.plane, follows * weight[:, None], follows)
     own += np.finfo(float).eps * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(d) + TINY * np.eye(d)
     inverse = bsr_array((np.linalg.inv(own), np.arange(count), np.arange(count + 1)))
-    hessian = (poses_move.T @ weighted - crossed.T @ (inverse @ crossed)).tocsc()[size:, size:]
-    force = (weighted.T @ planes.offset[:, 0])[size:]
-    diagonal = hessian.diagonal()
-    step = spsolve(csc_array(hessian + diags_array(DAMPING * diagonal + TINY)), -force)
+    alone = poses_move.T @ weighted
+    hessian = (alone - crossed.T @ (inverse @ crossed)).tocsc()[size:, size:]
+    # The planes were fitted with the weights before the last: what they would still follow is no force on the poses.
+    height = planes.offset[:, 0]
+    force = (weighted.T @ height - crossed.T @ (inverse @ (planes_move.T @ (weight * height))))[size:]
+    # Of the poses alone: a scan that shares no plane keeps nothing but rounding of its own share.
+    diagonal = alone.diagonal()[size:]
+    step = spsolve(csc_array(hessian + diags_array(DAMPING * diagonal + (diagonal == 0))), -force)
     return np.concatenate((np.zeros(size), step)).reshape(len(poses), size)
 
 
