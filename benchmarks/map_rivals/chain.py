@@ -13,8 +13,9 @@ from train.scans import Progress, ScanSet
 WINDOW, APART, NEAR, LOOPS_PER_SCAN = 3, 9, 0.5, 3
 # Points of a scan whose overlap is looked at.
 LOOKED_AT = 2000
-# How a rival's chain begins: as it is made, from turned starts where the overlap is poor, from matched features.
+# A rival's variants: as it is made, with turned starts where the overlap is poor, with matched features, with a graph.
 PLAIN, YAW, FEATURES = "plain", "yaw starts", "feature starts"
+GRAPH, GRAPH_YAW = "graph", "graph, yaw starts"
 Solutions = Iterator[tuple[str, np.ndarray]]
 
 

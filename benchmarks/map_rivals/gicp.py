@@ -24,7 +24,8 @@ from train.scans import Progress, ScanSet
 
 # Neighbours of a normal: the library's default. Rows of a drawn out planar scan.
 NEIGHBOURS, ROWS = 20, 4
-STEPS, TIGHT = 100, 1e-7
+# At most so many steps a run, and a step that counts as none, radians and reaches.
+STEPS, TIGHT = 100, 1e-5
 
 
 class Setting(NamedTuple):

@@ -34,7 +34,8 @@ NORMAL_NEIGHBOURS, FEATURE_NEIGHBOURS, PRUNED = 30, 100, 0.25
 RANSAC_TRIES, SURE = 100_000, 0.999
 # Least voxel of clouds that are described by features, reaches: RANSAC's time grows with their number.
 FEATURE_VOXEL = 0.05
-STEPS, TIGHT = 50, 1e-7
+# The defaults of the library: at most so many steps a run, and a relative gain that counts as none.
+STEPS, TIGHT = 30, 1e-6
 
 
 class Setting(NamedTuple):

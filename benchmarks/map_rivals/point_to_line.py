@@ -12,6 +12,8 @@ from scipy.spatial import KDTree
 
 from bbr_layer import RigidMotion
 from benchmarks.map_rivals.chain import (
+    GRAPH,
+    GRAPH_YAW,
     PLAIN,
     YAW,
     Overlap,
@@ -37,7 +39,7 @@ NEIGHBOURS, THICK = 5, 0.1
 # Huber's width in standard deviations, and a standard deviation of a Gaussian in median residuals.
 HUBER, DEVIATION = 1.345, 1.4826
 # A step that counts as none, radians and reaches; the least residual scale, reaches.
-TIGHT, FLOOR = 1e-8, 1e-9
+TIGHT, FLOOR = 1e-7, 1e-9
 # Loops count from this part of the chain's median overlap; rounds of seeking them.
 LOOP_SHARE, ROUNDS = 0.8, 2
 
@@ -130,21 +132,18 @@ class PointToLine:
 
 
 def solved(scans: ScanSet, setting: tuple[float, bool], told: Progress) -> Solutions:
-    """Poses ``(k, 3, 3)`` along the chain; ``setting``: the widest gate, and whether to begin at the last motion."""
-    rival = PointToLine(scans, setting[0])
-    motions = chained(rival, 3, setting[1], told)
-    yield PLAIN, in_own_unit(along(motions), reach(scans))
-    yield YAW, in_own_unit(along(from_turned_starts(rival, motions, told)), reach(scans))
+    """Poses ``(k, 3, 3)`` along the chain, and those that it, a window and loops agree on.
 
-
-def solved_by_graph(scans: ScanSet, setting: tuple[float, bool], told: Progress) -> Solutions:
-    """Poses ``(k, 3, 3)`` that the chain, a window and loops agree on; ``setting`` as of the chain."""
+    ``setting``: the widest gate, and whether to begin at the last motion.
+    """
     rival, unit = PointToLine(scans, setting[0]), reach(scans)
     motions = chained(rival, 3, setting[1], told)
-    plain = agreed(rival, motions, told)
-    yield PLAIN, in_own_unit(plain, unit)
+    yield PLAIN, in_own_unit(along(motions), unit)
+    graph = agreed(rival, motions, told)
+    yield GRAPH, in_own_unit(graph, unit)
     found = from_turned_starts(rival, motions, told)
-    yield YAW, in_own_unit(plain if np.array_equal(found, motions) else agreed(rival, found, told), unit)
+    yield YAW, in_own_unit(along(found), unit)
+    yield GRAPH_YAW, in_own_unit(graph if np.array_equal(found, motions) else agreed(rival, found, told), unit)
 
 
 def agreed(rival: PointToLine, motions: np.ndarray, told: Progress) -> np.ndarray:
@@ -155,14 +154,15 @@ def agreed(rival: PointToLine, motions: np.ndarray, told: Progress) -> np.ndarra
     if count > 2:
         edges = edges.joined(_from(rival, window_pairs(count), poses, overlap))
     poses = _solved_graph(edges, poses)
-    local = edges
     for turn in range(ROUNDS):
         told("rounds of loops", turn + 1, ROUNDS)
-        pairs = loop_pairs(poses)
-        if pairs:
-            loops = _from(rival, pairs, poses, overlap)
-            edges = local.joined(loops.kept(loops.score >= least))
-            poses = _solved_graph(edges, poses)
+        joined = set(zip(edges.target.tolist(), edges.source.tolist(), strict=True))
+        pairs = [pair for pair in loop_pairs(poses) if pair not in joined]
+        if not pairs:
+            break
+        loops = _from(rival, pairs, poses, overlap)
+        edges = edges.joined(loops.kept(loops.score >= least))
+        poses = _solved_graph(edges, poses)
     return poses
 
 

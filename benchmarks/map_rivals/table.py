@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 
-from benchmarks.map_rivals.chain import PLAIN
+from benchmarks.map_rivals.chain import GRAPH, PLAIN
 from benchmarks.mapping_rows import ROWS
 
 OURS = "ours"
@@ -67,7 +67,7 @@ def marked(numbers: list[float | None]) -> list[str]:
 
 
 def table_of(results: Results, rows: list[str], units: dict[str, str]) -> list[str]:
-    """Errors of the rows, and the median and the worst where all rows have one unit and are many of a kind."""
+    """Errors of the rows at each rival's best setting, a column for each kind of start."""
     columns = columns_of(results, rows)
     lines = _head(["sequence", "unit", *map(_title, columns)])
     numbers = [numbers_of(results, row, columns, ERROR) for row in rows]
@@ -92,7 +92,7 @@ def summary_of(results: Results, groups: dict[str, list[str]], units: dict[str, 
 
 def seconds_of(results: Results, rows: list[str]) -> list[str]:
     """CPU seconds of each rival's chosen setting as it is made, all rows together."""
-    columns = [column for column in columns_of(results, rows) if column[1] == PLAIN]
+    columns = [column for column in columns_of(results, rows) if column[1] in (PLAIN, GRAPH)]
     lines = _head(["rows", *map(_title, columns)])
     held = zip(*(numbers_of(results, row, columns, SECONDS) for row in rows), strict=True)
     sums = [f"{sum(numbers):.0f}" if None not in numbers else "" for numbers in held]
