@@ -26,13 +26,14 @@ from benchmarks.map_rivals.table import (
     OURS,
     SECONDS,
     Results,
+    lacking,
     own_figures,
     seconds_of,
     standing,
     summary_of,
     table_of,
 )
-from benchmarks.mapping_rows import ROWS, Row
+from benchmarks.mapping_rows import PIXELS, ROWS, Row
 from benchmarks.mapping_table import map_errors, measured
 from train.scans import ScanSet
 
@@ -97,8 +98,8 @@ def solved(row: Row, scans: ScanSet, rival: Rival, setting: Any, told: Callable)
     return found
 
 
-def measure(name: str, only: list[str], results: Results) -> None:
-    """Fill in what the results lack of one row, and keep them after each setting."""
+def measure(name: str, only: list[str], settings: tuple[str, ...], results: Results) -> None:
+    """Fill in what the results lack of one row, of some rivals and settings, and keep them after each setting."""
     row = ALL_ROWS[name]
     held, scans = results.setdefault(name, {}), row.make()
     if name in FLOOR_PLANS and OURS not in held:
@@ -109,7 +110,7 @@ def measure(name: str, only: list[str], results: Results) -> None:
         if only and title not in only:
             continue
         for words, setting in rival.settings.get(scans.dimension, {}).items():
-            if words in held.setdefault(title, {}):
+            if words in held.setdefault(title, {}) or not words.startswith(settings):
                 continue
             held[title][words] = solved(row, scans, rival, setting, partial(_tell, name, title))
             shown = ", ".join(f"{start} {found[ERROR]:.3g}" for start, found in held[title][words].items())
@@ -146,8 +147,8 @@ def document(results: Results) -> str:
     groups = {f"movers {share} %": [row for row in flat if f"movers {share} %" in row] for share in (20, 40)}
     groups |= {"plans": plans, "plans with movers": [row for row in plans if "movers" in row]}
     groups = {name: rows for name, rows in groups.items() if rows}
-    lines += ["## Medians and worst", "", *summary_of(merged, groups, units), "", *_settings()]
-    return "\n".join(lines) + "\n"
+    lines += ["## Medians and worst", "", *summary_of(merged, groups, units), "", *_settings(), "", *_not_run(results)]
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def _ordered(held: dict[str, Any]) -> dict[str, Any]:
@@ -167,17 +168,27 @@ def _settings() -> list[str]:
     return lines
 
 
+def _not_run(results: Results) -> list[str]:
+    wanted = {}
+    for name in results:
+        dimension = 2 if ALL_ROWS[name].unit is PIXELS or name in FLOOR_PLANS else 3
+        wanted[name] = {title: list(rival.settings.get(dimension, {})) for title, rival in RIVALS.items()}
+    lines = lacking(results, wanted)
+    return ["## Not run, for want of time", "", *lines] if lines else []
+
+
 def main() -> None:
     """Measure the rows asked for and write the table after each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[""], help="rows that begin with one of these")
     parser.add_argument("--rivals", nargs="+", default=[], choices=list(RIVALS), help="these rivals; all without it")
+    parser.add_argument("--settings", nargs="+", default=[""], help="settings that begin with one of these")
     parser.add_argument("--out", type=Path, default=Path("benchmarks", "mapping_rivals.md"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     results: Results = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     for name in (name for name in ALL_ROWS if name.startswith(tuple(options.only))):
-        measure(name, options.rivals, results)
+        measure(name, options.rivals, tuple(options.settings), results)
         with atomic_write(options.out) as temporary:
             temporary.write_text(document(results))
 

@@ -21,7 +21,18 @@ from benchmarks.map_rivals.chain import (
     window_pairs,
 )
 from benchmarks.map_rivals.floor_plans import FLOOR_PLANS
-from benchmarks.map_rivals.table import ERROR, OURS, SECONDS, best, marked, own_figures, parsed, standing, table_of
+from benchmarks.map_rivals.table import (
+    ERROR,
+    OURS,
+    SECONDS,
+    best,
+    lacking,
+    marked,
+    own_figures,
+    parsed,
+    standing,
+    table_of,
+)
 from benchmarks.mapping_rivals import document
 from train.evaluate import evaluate_trajectory
 from train.poses import embed_poses
@@ -194,6 +205,14 @@ def test_each_rival_gets_its_better_setting_and_the_best_is_bold():
     lines = table_of(results, ["a", "b"], {"a": "m", "b": "m"})
     assert lines[2:] == ["| a | m | 0.2 | **0.1** |", "| b | m | **0.2** | inf |"]
     assert standing(results, ["a", "b"]) == "Ours is best, alone or level, in 1 of 2 rows.\n- a: x"
+
+
+def test_settings_that_were_not_run_are_named():
+    results = {"a": {"x": {"s": {PLAIN: numbers(0.3)}}}, "b": {}}
+    assert lacking(results, {"a": {"x": ["s", "t"]}, "b": {"x": ["s"]}}) == [
+        "- x, 0 of 1 settings: b",
+        "- x, 1 of 2 settings: a",
+    ]
 
 
 def test_figures_that_print_alike_are_level():

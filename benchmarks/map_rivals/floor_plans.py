@@ -8,13 +8,14 @@ from train.simulate import WorldSettings, simulate
 
 PLANS = 20
 KINDS = ("rooms", "loop", "corridor")
-# People and trolleys of every second plan.
-MOVERS = 4
+# As many as close their loop, and rays of one; people and trolleys of every second plan.
+SCANS, BEAMS, MOVERS = 48, 180, 4
 
 
 def settings(seed: int) -> WorldSettings:
-    """64 scans of 256 beams with 1 cm of noise; the kinds in turn, movers in every second plan."""
-    return WorldSettings(kind=KINDS[seed % len(KINDS)], movers=MOVERS * (seed % 2), seed=seed)
+    """Ranges with 1 cm of noise; the kinds in turn, movers in every second plan."""
+    kind, movers = KINDS[seed % len(KINDS)], MOVERS * (seed % 2)
+    return WorldSettings(kind=kind, scans=SCANS, beams=BEAMS, movers=movers, seed=seed)
 
 
 def floor_plan(seed: int) -> ScanSet:

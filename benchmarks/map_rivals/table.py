@@ -106,14 +106,25 @@ def standing(results: Results, rows: list[str]) -> str:
     for row in rows:
         cells = marked(numbers_of(results, row, columns, ERROR))
         if not cells[columns.index((OURS, PLAIN))].startswith("**"):
-            lost[row] = ", ".join(_title(x) for x, cell in zip(columns, cells, strict=True) if cell.startswith("**"))
+            lost[row] = "; ".join(_title(x) for x, cell in zip(columns, cells, strict=True) if cell.startswith("**"))
     sentence = f"Ours is best, alone or level, in {len(rows) - len(lost)} of {len(rows)} rows."
     return sentence + "".join(f"\n- {row}: {who}" for row, who in lost.items())
 
 
+def lacking(results: Results, wanted: dict[str, dict[str, list[str]]]) -> list[str]:
+    """Of which rivals fewer settings were run than ``wanted`` by row and rival, and in which rows, a line each."""
+    rows: dict[str, list[str]] = {}
+    for row, held in results.items():
+        for rival, words in wanted[row].items():
+            run = sum(word in held.get(rival, {}) for word in words)
+            if run < len(words):
+                rows.setdefault(f"{rival}, {run} of {len(words)} settings", []).append(row)
+    return [f"- {what}: " + "; ".join(names) for what, names in sorted(rows.items())]
+
+
 def _title(column: tuple[str, str]) -> str:
     rival, start = column
-    return rival if start == PLAIN else f"{rival}, {start}"
+    return rival if start == PLAIN else f"{rival} + {start.replace(', ', ' + ')}"
 
 
 def _head(titles: list[str]) -> list[str]:
