@@ -11,6 +11,7 @@ import json
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from bbr_layer import atomic_write
@@ -19,6 +20,7 @@ from train.config import EdgeConfig
 from train.edges import register_edges
 from train.evaluate import evaluate_trajectory
 from train.poses import embed_poses
+from train.scans import ScanSet
 
 MEASURES = ("ape_rmse", "point_rms_displacement")
 
@@ -29,12 +31,16 @@ def measured(row: Row) -> dict[str, float]:
     begin = time.perf_counter(), time.process_time()
     edges, poses = register_edges(scans, EdgeConfig(), lambda *told: print("\r", *told, end="   ", flush=True))
     found = {"seconds": time.perf_counter() - begin[0], "CPU seconds": time.process_time() - begin[1]}
+    return found | map_errors(poses.matrix.numpy(), scans, row) | {"scans": len(scans), "edges": len(edges.target)}
+
+
+def map_errors(poses: np.ndarray, scans: ScanSet, row: Row) -> dict[str, float]:
+    """Errors of poses ``(k, m, m)`` in the row's unit, rotation in degrees."""
     assert scans.truth is not None
     spatial = scans.points if scans.dimension == 3 else None
-    errors = evaluate_trajectory(embed_poses(poses.matrix.numpy()), embed_poses(scans.truth), spatial)
-    found |= {name: errors[name] * row.unit.scale for name in MEASURES if name in errors}
-    found["degrees"] = errors["rotation_error_mean_deg"]
-    return found | {"scans": len(scans), "edges": len(edges.target)}
+    errors = evaluate_trajectory(embed_poses(poses), embed_poses(scans.truth), spatial)
+    found = {name: errors[name] * row.unit.scale for name in MEASURES if name in errors}
+    return found | {"degrees": errors["rotation_error_mean_deg"]}
 
 
 def line(name: str, found: dict[str, float]) -> str:
