@@ -8,10 +8,11 @@ from torch import Tensor
 from bbr_layer import estimate_normals, evenly_thinned
 from train.scans import ScanSet
 
-# Normals are fitted to this many neighbours of the full scan before it is thinned: a line in 2D. In 3D 13, the paper's
-# for a surface, reach along one ring of a lidar and not to the next (the paper takes 94 there); with 30 kitti00 and
-# tum of benchmarks/mapping_table.md come nearer.
-NORMAL_NEIGHBOURS = {2: 6, 3: 30}
+# Normals are fitted to so many neighbours of the full scan before it is thinned: a line in the plane. In space the
+# paper's 13, which reach along one ring of a dense lidar and not to the next (the paper takes 94 there): one per so many
+# points, up to 30, with which kitti00 and tum of benchmarks/mapping_table.md come nearer.
+PLANAR_NEIGHBOURS = 6
+FEWEST_NEIGHBOURS, POINTS_PER_NEIGHBOUR, MOST_NEIGHBOURS = 13, 1000, 30
 
 
 class Prepared(NamedTuple):
@@ -24,14 +25,19 @@ class Prepared(NamedTuple):
 
 def prepare(scans: ScanSet, most: int) -> Prepared:
     """Normals from the full scans, then at most ``most`` points of each, spread evenly in space."""
-    neighbours = NORMAL_NEIGHBOURS[scans.dimension]
     chosen, normals = [], []
     for scan in scans.points:
         points = torch.from_numpy(scan)
         kept = torch.from_numpy(evenly_thinned(scan, most))
         chosen.append(points[kept])
-        normals.append(estimate_normals(points, neighbours)[kept])
+        normals.append(estimate_normals(points, _neighbours(points))[kept])
     return _padded(chosen, normals)
+
+
+def _neighbours(points: Tensor) -> int:
+    if points.shape[1] == 2:
+        return PLANAR_NEIGHBOURS
+    return min(max(FEWEST_NEIGHBOURS, len(points) // POINTS_PER_NEIGHBOUR), MOST_NEIGHBOURS)
 
 
 def thinned(prepared: Prepared, most: int) -> Prepared:
