@@ -9,8 +9,8 @@ from bbr_layer import estimate_normals, evenly_thinned
 from train.scans import ScanSet
 
 # Normals are fitted to so many neighbours of the full scan before it is thinned: a line in the plane. In space the
-# paper's 13, which reach along one ring of a dense lidar and not to the next (the paper takes 94 there): one per so many
-# points, up to 30, with which kitti00 and tum of benchmarks/mapping_table.md come nearer.
+# paper's 13, which reach along one ring of a dense lidar and not to the next (the paper takes 94 there): one per so
+# many points, up to 30, with which kitti00 and tum of benchmarks/mapping_table.md come nearer.
 PLANAR_NEIGHBOURS = 6
 FEWEST_NEIGHBOURS, POINTS_PER_NEIGHBOUR, MOST_NEIGHBOURS = 13, 1000, 30
 
