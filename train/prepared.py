@@ -12,7 +12,7 @@ from train.scans import ScanSet
 # paper's 13, which reach along one ring of a dense lidar and not to the next (the paper takes 94 there): one per so
 # many points, up to 30, with which kitti00 and tum of benchmarks/mapping_table.md come nearer.
 PLANAR_NEIGHBOURS = 6
-FEWEST_NEIGHBOURS, POINTS_PER_NEIGHBOUR, MOST_NEIGHBOURS = 13, 1000, 30
+FEWEST_NEIGHBOURS, POINTS_PER_NEIGHBOUR, MOST_NEIGHBOURS = 13, 500, 30
 
 
 class Prepared(NamedTuple):
