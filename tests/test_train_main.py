@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from bbr_layer import read_poses, write_poses_tum
 from train.__main__ import app
 from train.config import load_config
+from train.console import _kept_sentence
 
 FAST = ("--epochs", "2")
 
@@ -58,6 +59,12 @@ def test_a_map_says_where_it_is_and_how_good(finished):
     assert error == pytest.approx(metrics["trajectory"]["ape_rmse"], rel=1e-3) and error < 0.3
     assert "Kept " in printed
     assert load_config(out / "config.yaml").training.epochs == 2
+
+
+def test_whose_poses_were_kept_is_said_as_it_is():
+    assert _kept_sentence(0, [1.0, 2.0], False) == "Kept the edges' map: no epoch of 1 scores better (1.0000)."
+    assert "the edges' map, adjusted to all scans at once" in _kept_sentence(0, [1.0, 2.0], True)
+    assert _kept_sentence(1, [2.0, 1.0], False) == "Kept epoch 1 of 1: score 1.0000, the starting map 2.0000."
 
 
 def test_evaluate_gives_the_same_errors(finished, world):

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -71,7 +72,10 @@ def show_map(console: Console, out: Path, mapped: Mapped, unit: PrintedUnit) -> 
     """Which epoch was kept, the errors where there is a truth, and the files."""
     curve = mapped.result.losses.get(SCORE, [])
     if curve:
-        console.print(_kept_sentence(mapped.kept_epoch, curve))
+        adjusted = mapped.kept_epoch == 0 and not np.allclose(
+            mapped.start.matrix.numpy(), mapped.result.world_from_scan, rtol=0, atol=1e-9
+        )
+        console.print(_kept_sentence(mapped.kept_epoch, curve, adjusted))
     truth = mapped.result.scans.truth
     if truth is not None:
         before = evaluate_trajectory(mapped.start.matrix.numpy(), truth)
@@ -97,8 +101,9 @@ def _printed(name: str, value: float | None, unit: PrintedUnit) -> str:
     return f"{value:.4g} deg" if name.endswith("_deg") else unit.length(value)
 
 
-def _kept_sentence(kept_epoch: int, curve: list[float]) -> str:
-    epochs = len(curve) - 1
+def _kept_sentence(kept_epoch: int, curve: list[float], adjusted: bool) -> str:
+    """``adjusted``: the first map is not that of the edges but adjusted to all scans at once."""
+    epochs, first = len(curve) - 1, "the edges' map" + adjusted * ", adjusted to all scans at once"
     if kept_epoch == 0:
-        return f"Kept the edges' map: no epoch of {epochs} aligns the held-out points better ({curve[0]:.4f})."
-    return f"Kept epoch {kept_epoch} of {epochs}: alignment {curve[kept_epoch]:.4f}, the edges' map {curve[0]:.4f}."
+        return f"Kept {first}: no epoch of {epochs} scores better ({curve[0]:.4f})."
+    return f"Kept epoch {kept_epoch} of {epochs}: score {curve[kept_epoch]:.4f}, the starting map {curve[0]:.4f}."

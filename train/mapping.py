@@ -27,7 +27,7 @@ class Mapped:
     ----------
     result: as it was written.
     start: ``world_from_scan (k, ...)`` of the edges' map, before the training.
-    kept_epoch: whose poses they are; 0 is the edges' map.
+    kept_epoch: whose poses they are; 0 is the edges' map, adjusted or not.
     """
 
     result: MapResult
