@@ -86,7 +86,8 @@ ORDER = {
         scene moving_points
         places
         pair_registration outputs
-        chain recognition given_motion loops
+        chain
+        recognition given_motion loops
         edges
         known_edges
         groups schedule

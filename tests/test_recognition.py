@@ -94,12 +94,15 @@ def test_no_key_scans_far_enough_apart_are_no_loops():
 
 def test_loops_are_found_whatever_a_broken_chain_says():
     scans, scene = _round_tour()
-    found = recognised(scene, true_edges(scans), _broken(true_poses(scans)), APART, silent)
+    chain = true_edges(scans)
+    chain = chain._replace(score=torch.full_like(chain.score, 0.4))
+    found = recognised(scene, chain, _broken(true_poses(scans)), APART, silent)
     off = _errors(found.target, found.source, found.target_from_source)
     across = (found.target < SCANS // 2) & (found.source >= SCANS // 2)
     assert (across & (off < scene.spacing)).sum() > 20
     assert (off < scene.spacing).double().mean() > 0.95, "rooms that look alike have fewer witnesses"
     assert (found.kind == 2).all()
+    assert found.score.min() >= 0.2, "half of the chain's median"
 
 
 def test_a_loop_is_believed_by_its_witnesses():
