@@ -19,8 +19,8 @@ NEAR_KEYS, SAME = 3, 5.0
 # Fewest witnesses of a loop that is believed, and fewest as a share of the most that a loop has: rooms that look alike
 # have witnesses too, but few, and their scores are low (``FOUND``): without that, three of the 20 floor plans of
 # benchmarks/mapping_rivals.md ended metres off. Measured on v1_pose0 with 20 and 40 % of its rays hidden, six
-# sequences: a third of all loops is wrong, of those with three witnesses 6 in 317; in a building of like rooms 23 in 89,
-# with the share none.
+# sequences: a third of all loops is wrong, of those with three witnesses 6 in 317; in a building of like rooms 23 in
+# 89, with the share none.
 WITNESSES, SHARE = 3, 0.2
 
 
