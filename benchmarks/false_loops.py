@@ -10,7 +10,6 @@ a right edge. Motions: any turn (about the vertical axis), shifts as far as two 
 """
 
 import argparse
-import json
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -18,24 +17,21 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from bbr_layer import RigidMotion, atomic_write
+from bbr_layer import RigidMotion
+from benchmarks.kept import keep, kept_results
 from benchmarks.mapping_rows import ROWS, Row
+from benchmarks.mapping_table import map_errors
 from train.config import EdgeConfig
-from train.edges import register_edges
-from train.evaluate import evaluate_trajectory
-from train.free_space_evidence import point_evidence, range_views
-from train.pose_graph import Edges, solve_pose_graph
-from train.poses import embed_poses
-from train.prepared import prepare
-from train.refinement import refine
-from train.scans import ScanSet
-from train.surfaces import surfaces
+from train.edges import refined, register_edges
+from train.loops import DOUBTED
+from train.pose_graph import Edges, solve_pose_graph, spanning_poses
+from train.prepared import prepare, thinned
+from train.scans import ScanSet, silent
+from train.scene import build_scene
 
 CHOSEN = ("v1_pose0, stride 2", "v1_pose0, noise 1 px", "v1_pose0, 180 deg", "balm 30-108, stride 1")
 SHARES, KINDS, SEEDS = (0.1, 0.3), ("scattered", "agreeing"), 5
 GROUP = 4
-# Edges believed less than this do not take part in the refinement, as in the mapper.
-DOUBTED = 0.3
 
 
 class Solved(NamedTuple):
@@ -45,28 +41,22 @@ class Solved(NamedTuple):
     believed: int
 
 
-def solved(row: Row, scans: ScanSet, edges: Edges, wrong: int) -> Solved:
-    """The map of these edges, of which the last ``wrong`` are wrong, from the poses of the chain and the window."""
-    sure = edges.kept(edges.kind < 2)
-    begin, _ = solve_pose_graph(sure, _along_the_chain(sure, len(scans)))
-    poses, belief = solve_pose_graph(edges, begin)
-    full = prepare(scans, EdgeConfig().refined_points)
-    clouds = surfaces(full)
-    pairs, found = torch.stack((edges.target, edges.source), 1).numpy(), poses.matrix.numpy()
-    evidence = point_evidence([cloud.points for cloud in clouds], (clouds, range_views(scans, clouds)), pairs, found)
-    trust = torch.where(belief > DOUBTED, belief, 0.0).numpy()
-    refined = refine(clouds, pairs, found, (trust, [one.weight for one in evidence]))
-    assert scans.truth is not None
-    errors = evaluate_trajectory(embed_poses(refined), embed_poses(scans.truth), None)
-    return Solved(errors["ape_rmse"] * row.unit.scale, int((belief[len(belief) - wrong :] > DOUBTED).sum()))
+class Solver:
+    """The mapper's own pose graph and refinement for the edges of one row; the scans are made ready once."""
 
+    def __init__(self, row: Row, scans: ScanSet) -> None:
+        self.row, self.scans, config = row, scans, EdgeConfig()
+        self.full = prepare(scans, config.refined_points)
+        self.scene = build_scene(scans, thinned(self.full, config.points))
 
-def _along_the_chain(edges: Edges, scans: int) -> RigidMotion:
-    chain = edges.kept(edges.kind == 0).target_from_source
-    poses = [RigidMotion.identity(chain.dimension)]
-    for edge in range(scans - 1):
-        poses.append(poses[-1] @ chain.item(edge))
-    return RigidMotion(*(torch.stack(field) for field in zip(*poses, strict=True)))
+    def __call__(self, edges: Edges, wrong: int) -> Solved:
+        """The map of edges of which the last ``wrong`` are wrong, from the poses of the chain and the window."""
+        sure = edges.kept(edges.kind < 2)
+        begin, _ = solve_pose_graph(sure, spanning_poses(edges.kept(edges.kind == 0), len(self.scans)))
+        poses, belief = solve_pose_graph(edges, begin)
+        found = refined(self.full, self.scene, (edges, belief), poses, silent).matrix.numpy()
+        error = map_errors(found, self.scans, self.row)[self.row.error]
+        return Solved(error, int((belief[len(belief) - wrong :] > DOUBTED).sum()))
 
 
 class Wrong(NamedTuple):
@@ -118,11 +108,12 @@ def measured(row: Row) -> dict[str, list[list[float]]]:
     scans = row.make()
     edges, poses = register_edges(scans, EdgeConfig(), lambda *told: print("\r", *told, end="   ", flush=True))
     reach = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in scans.points]))
-    results = {"0": [[solved(row, scans, edges, 0).error, 0.0, 0.0]]}
+    solved = Solver(row, scans)
+    results = {"0": [[solved(edges, 0).error, 0.0, 0.0]]}
     for share, kind, seed in product(SHARES, KINDS, range(SEEDS)):
         print(f"\r{share} {kind} {seed}", end="      ", flush=True)
         more = wrong_loops(edges, poses, reach, Wrong(share, kind, seed))
-        found = solved(row, scans, edges.joined(more), len(more.target))
+        found = solved(edges.joined(more), len(more.target))
         results.setdefault(f"{share} {kind}", []).append([found.error, found.believed, len(more.target)])
     return results
 
@@ -163,16 +154,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("benchmarks", "false_loops.md"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    kept = Path("out", "benchmark", f"{options.out.stem}.json")
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    results = json.loads(kept.read_text()) if kept.exists() else {}
+    results = kept_results(options.out)
     for name in CHOSEN:
         if not name.startswith(tuple(options.only)) or (name in results and not options.again):
             continue
         results[name] = measured(ROWS[name])
-        for path, text in ((kept, json.dumps(results, indent=1)), (options.out, table(results))):
-            with atomic_write(path) as temporary:
-                temporary.write_text(text)
+        keep(results, table(results), options.out)
     print("\n" + table(results))
 
 

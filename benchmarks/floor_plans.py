@@ -10,7 +10,6 @@ measured again.
 """
 
 import argparse
-import json
 import logging
 import time
 from collections.abc import Iterator
@@ -18,16 +17,17 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
-from bbr_layer import RigidMotion, atomic_write
+from bbr_layer import RigidMotion
+from benchmarks.kept import keep, kept_results
+from benchmarks.mapping_rows import simulated
 from train.config import EdgeConfig, MapConfig, TrainingConfig
 from train.edges import register_edges
 from train.evaluate import evaluate_trajectory
 from train.poses import embed_poses
 from train.scans import ScanSet
-from train.simulate import WorldSettings, simulate
+from train.simulate import WorldSettings
 from train.training import train_map
 
 SCANS, RAYS, EPOCHS, FIRST_SEED = 48, 180, 10, 100
@@ -55,10 +55,7 @@ class Way(NamedTuple):
 def floor_plan(condition: str, seed: int) -> ScanSet:
     """Planar scans in metres with their true poses, the first at the origin."""
     noise, movers = CONDITIONS[condition]
-    world = simulate(WorldSettings(scans=SCANS, beams=RAYS, noise_m=noise, movers=movers, seed=seed))
-    truth = world.world_from_scan[:, [0, 1, 3]][:, :, [0, 1, 3]]
-    names = [str(number) for number in range(SCANS)]
-    return ScanSet(world.points, names, world.timestamps, truth=np.linalg.inv(truth[0]) @ truth)
+    return simulated(WorldSettings(scans=SCANS, beams=RAYS, noise_m=noise, movers=movers, seed=seed))
 
 
 def ate(poses: RigidMotion, scans: ScanSet) -> float:
@@ -124,9 +121,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-    kept = Path("out", "benchmark", f"{options.out.stem}.json")
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    results: dict[str, Found] = json.loads(kept.read_text()) if kept.exists() else {}
+    results: dict[str, Found] = kept_results(options.out)
     jobs = [(c, FIRST_SEED + n, [Way(MAIN)]) for n in range(options.seeds) for c in CONDITIONS]
     every = [Way(term, adjust) for adjust in (False, True) for term in TERMS]
     jobs += [(COMPARED_IN, FIRST_SEED + n, every) for n in range(options.compared)]
@@ -137,9 +132,7 @@ def main() -> None:
             found[name] = one
             told = f"{number + 1}/{len(jobs)} {condition}, seed {seed}, {name}: {one['ate']:.1f} mm, {one['cpu']:.1f} s"
             print(told, flush=True)
-            for path, text in ((kept, json.dumps(results, indent=1)), (options.out, table(results))):
-                with atomic_write(path) as temporary:
-                    temporary.write_text(text)
+            keep(results, table(results), options.out)
 
 
 if __name__ == "__main__":

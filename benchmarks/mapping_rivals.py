@@ -132,6 +132,7 @@ def document(results: Results) -> str:
     """All tables, of what was measured so far."""
     own = own_figures(OWN)
     merged = {row: _ordered(own.get(row, {}) | results[row]) for row in ALL_ROWS if row in results}
+    merged = {row: held for row, held in merged.items() if OURS in held}
     units = {name: row.unit.name for name, row in ALL_ROWS.items()}
     flat = [row for row in merged if row.startswith("v1_pose0")]
     plans = [row for row in merged if row in FLOOR_PLANS]

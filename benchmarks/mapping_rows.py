@@ -13,7 +13,8 @@ import numpy as np
 
 from benchmarks.data import data_folder
 from train.console import PrintedUnit
-from train.scans import ScanSet
+from train.scans import ScanSet, planar_poses
+from train.simulate import WorldSettings, simulate
 
 # Side of v1_pose0's picture: its unit is 512 px.
 SIDE = 512.0
@@ -46,6 +47,13 @@ def sequence(file: str, stride: int = 1) -> ScanSet:
     truth = np.linalg.inv(poses[0]) @ poses[chosen]
     truth = truth[:, [0, 1, 3]][:, :, [0, 1, 3]] if flat else truth
     return ScanSet(scans, [str(i) for i in chosen], chosen.astype(float), truth=truth)
+
+
+def simulated(settings: WorldSettings) -> ScanSet:
+    """Scans of a planar world in the frame of the first one, with their truth."""
+    world = simulate(settings)
+    truth = planar_poses(np.linalg.inv(world.world_from_scan[0]) @ world.world_from_scan, "truth")
+    return ScanSet(world.points, [str(i) for i in range(len(truth))], world.timestamps, truth=truth)
 
 
 def noisy(scans: ScanSet, deviation: float, seed: int = 0) -> ScanSet:

@@ -7,14 +7,13 @@ results file (``out/benchmark``, named as the table) already holds are not measu
 """
 
 import argparse
-import json
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from bbr_layer import atomic_write
+from benchmarks.kept import keep, kept_results
 from benchmarks.mapping_rows import ROWS, Row
 from train.config import EdgeConfig
 from train.edges import register_edges
@@ -80,18 +79,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("benchmarks", "mapping_table.md"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    kept = Path("out", "benchmark", f"{options.out.stem}.json")
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    results = json.loads(kept.read_text()) if kept.exists() else {}
+    results = kept_results(options.out)
     chosen = [name for name in ROWS if name.startswith(tuple(options.only))]
     for name in chosen:
         if name in results and not options.again:
             continue
         results[name] = measured(ROWS[name])
         print("\r" + line(name, results[name]), flush=True)
-        for path, text in ((kept, json.dumps(results, indent=1)), (options.out, table(results))):
-            with atomic_write(path) as temporary:
-                temporary.write_text(text)
+        keep(results, table(results), options.out)
 
 
 if __name__ == "__main__":

@@ -19,13 +19,16 @@ SCANS, BEAMS = 8, 64
 @functools.cache
 def small_world(dimension: int = 2) -> ScanSet:
     """Eight scans, with their truth and no starting poses; the world begins at the first scan."""
-    world = simulate(WorldSettings(dimension=dimension, scans=SCANS, beams=BEAMS, rings=8))
-    truth = world.world_from_scan
-    truth = np.linalg.inv(truth[0]) @ truth
-    if dimension == 2:
+    return world_of(WorldSettings(dimension=dimension, scans=SCANS, beams=BEAMS, rings=8))
+
+
+def world_of(settings: WorldSettings) -> ScanSet:
+    """The scans of a simulated world, which begins at the first of them."""
+    world = simulate(settings)
+    truth = np.linalg.inv(world.world_from_scan[0]) @ world.world_from_scan
+    if settings.dimension == 2:
         truth = planar_poses(truth, "truth")
-    names = [f"{number}.ply" for number in range(SCANS)]
-    return ScanSet(world.points, names, world.timestamps, truth=truth)
+    return ScanSet(world.points, [f"{number}.ply" for number in range(len(truth))], world.timestamps, truth=truth)
 
 
 def small_config(**training: object) -> MapConfig:

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 import torch
-from small_worlds import true_edges, true_poses
+from small_worlds import true_edges, true_poses, world_of
 
 from bbr_layer import RigidMotion
 from train import edges as edges_file
@@ -15,9 +15,9 @@ from train.edges import register_edges
 from train.places import alike, draw
 from train.prepared import prepare
 from train.recognition import SAME, recognised, witnesses
-from train.scans import ScanSet, planar_poses, silent
+from train.scans import ScanSet, silent
 from train.scene import Scene, build_scene
-from train.simulate import WorldSettings, simulate
+from train.simulate import WorldSettings
 
 # Scans of a building that is once gone around, the last ones where the first were made.
 SCANS, APART = 48, 9
@@ -25,9 +25,7 @@ SCANS, APART = 48, 9
 
 @functools.cache
 def _round_tour() -> tuple[ScanSet, Scene]:
-    world = simulate(WorldSettings(scans=SCANS, beams=180, seed=1))
-    truth = planar_poses(np.linalg.inv(world.world_from_scan[0]) @ world.world_from_scan, "truth")
-    scans = ScanSet(world.points, [str(number) for number in range(SCANS)], world.timestamps, truth=truth)
+    scans = world_of(WorldSettings(scans=SCANS, beams=180, seed=1))
     return scans, build_scene(scans, prepare(scans, 1000))
 
 
@@ -58,7 +56,7 @@ def test_the_likest_pairs_are_true_to_a_cell():
 
 
 def test_a_correlation_is_the_sum_over_cells():
-    """At the turn 0 and any shift: hits of the one on what the other expects, and the other way round."""
+    """At the best turn and shift, and less beside it: hits of each scan on what the other expects."""
     _, scene = _round_tour()
     pictures = draw(scene, [3, 40])
     best = alike(scene, [3, 40], APART)

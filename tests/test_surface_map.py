@@ -115,9 +115,9 @@ def test_poses_that_score_no_better_are_refused():
     surfaces = surface_map(scans, scans.truth)
     start = RigidMotion.from_matrix(torch.from_numpy(scans.truth))
     score = MapScore(lambda poses: 0.0, surfaces)
-    surfaces.adjusted = lambda poses: shaken(poses, 0.05)
+    surfaces.adjusted = lambda poses, _: shaken(poses, 0.05)
     assert score.adjusted(start) is start
     near = RigidMotion.from_matrix(torch.from_numpy(shaken(scans.truth, 0.05)))
-    surfaces.adjusted = lambda poses: scans.truth
+    surfaces.adjusted = lambda poses, _: scans.truth
     assert torch.equal(score.adjusted(near).matrix, start.matrix)
     assert score(start) == pytest.approx(10 * surfaces.thickness(scans.truth))

@@ -46,7 +46,7 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
     edges, poses, belief = _closed(scene, _window(scene, scans, config, progress), config, progress)
     edges, belief = without_given(edges, belief)
     edges = edges._replace(score=edges.score * belief)
-    return edges, _refined(full, scene, (edges, belief), poses, progress)
+    return edges, refined(full, scene, (edges, belief), poses, progress)
 
 
 def _window(scene: Scene, scans: ScanSet, config: EdgeConfig, progress: Progress) -> Graph:
@@ -86,7 +86,7 @@ def _closed(scene: Scene, graph: Graph, config: EdgeConfig, progress: Progress) 
     return edges, poses, belief
 
 
-def _refined(
+def refined(
     full: Prepared, scene: Scene, graph: tuple[Edges, Tensor], poses: RigidMotion, progress: Progress
 ) -> RigidMotion:
     """Poses at which all scans' points agree; ``graph``: the edges, and how far each was believed."""
@@ -96,8 +96,8 @@ def _refined(
     found = poses.matrix.numpy()
     evidence = point_evidence([scan.points for scan in clouds], (scene.surfaces, scene.views), pairs, found)
     trust = torch.where(belief > DOUBTED, belief, 0.0).numpy()
-    refined = refine(clouds, pairs, found, (trust, [one.weight for one in evidence]), progress)
-    return RigidMotion.from_matrix(torch.from_numpy(refined))
+    placed = refine(clouds, pairs, found, (trust, [one.weight for one in evidence]), progress)
+    return RigidMotion.from_matrix(torch.from_numpy(placed))
 
 
 def _anchored(poses: RigidMotion, scans: ScanSet) -> RigidMotion:

@@ -13,8 +13,7 @@ from train.scans import ScanSet
 
 # Kind of an edge that no scan was registered for.
 GIVEN = 3
-# An edge whose score is below this part of the chain's median found nothing: of the Intel log's scans that share
-# nothing with the next, all are.
+# An edge whose score is below this part of the chain's median found nothing.
 FAINT = 0.3
 # A registered edge is taken to be right to this part of a point spacing, against which the given ones are weighed.
 RIGHT_TO = 0.1

@@ -16,11 +16,9 @@ KEYS, PAIRS_PER_KEY = 48, 2
 # Another loop is a witness when, between scans this many keys away at most, it leads to the same motion along the
 # chain, within so many point spacings.
 NEAR_KEYS, SAME = 3, 5.0
-# Fewest witnesses of a loop that is believed, and fewest as a share of the most that a loop has: rooms that look alike
-# have witnesses too, but few, and their scores are low (``FOUND``): without that, three of the 20 floor plans of
-# benchmarks/mapping_rivals.md ended metres off. Measured on v1_pose0 with 20 and 40 % of its rays hidden, six
-# sequences: a third of all loops is wrong, of those with three witnesses 6 in 317; in a building of like rooms 23 in
-# 89, with the share none.
+# Fewest witnesses of a loop that is believed, and fewest as a share of the most that a loop has. Rooms that look alike
+# have witnesses too, but few, and low scores: hence the share, and ``FOUND``, without which some of the floor plans of
+# benchmarks/mapping_rivals.md end metres off.
 WITNESSES, SHARE = 3, 0.2
 
 

@@ -17,11 +17,11 @@ from train.data_module import PreparedScan, draw
 from train.free_space_evidence import point_evidence, range_views
 from train.planes import Placed, Planes, fitted, thinning_step
 from train.refinement import moved
-from train.scans import ScanSet
+from train.scans import Progress, ScanSet, silent
 from train.surfaces import Surface, spacing_of
 
-# Most points of a scan in the map, evenly spread. With 512 or 2048 the planes of kitti07's submaps are so wide that the
-# map is thinnest twice as far off the truth; with 5000 the score refuses it.
+# Most points of a scan in the map, evenly spread: with fewer, planes of large scans are so wide that the map is
+# thinnest away from the truth.
 MOST_POINTS = 5000
 # A plane is fitted to the points within this many point spacings of one scan: with 3, movers bend the map.
 REACH = 2.0
@@ -57,9 +57,9 @@ class SurfaceMap:
         world_from_scan: Float[np.ndarray, "k d1 d1"],
     ):
         self.points = _joined(prepared)
-        clouds = [self.points.points[self.points.owner == number] for number in range(len(prepared))]
+        first = np.flatnonzero(np.diff(self.points.owner)) + 1
+        clouds, normals = (np.split(part, first) for part in self.points[:2])
         trees = [cKDTree(cloud) for cloud in clouds]
-        normals = [self.points.normals[self.points.owner == number] for number in range(len(prepared))]
         found = [Surface(*one, spacing_of(one[2])) for one in zip(clouds, normals, trees, strict=True)]
         self.reach = REACH * float(np.median([surface.spacing for surface in found]))
         here = self.points.at(world_from_scan)
@@ -84,19 +84,23 @@ class SurfaceMap:
         outliers, believed = (np.bincount(planes.plane, x) for x in (belief * squared / (1 + squared), belief))
         return float(((outliers / believed).sum() + (asked - len(believed)) / 2) / asked)
 
-    def adjusted(self, world_from_scan: Float[np.ndarray, "k d1 d1"]) -> Float[np.ndarray, "k d1 d1"]:
+    def adjusted(
+        self, world_from_scan: Float[np.ndarray, "k d1 d1"], progress: Progress = silent
+    ) -> Float[np.ndarray, "k d1 d1"]:
         """Poses at which the surfaces of the map are thinnest, from poses near them; the first is kept.
 
         Gauss-Newton on all poses with the planes eliminated (Liu and Zhang, BALM: Bundle Adjustment for Lidar
         Mapping, RA-L 2021), found anew at every step; robust by iterated weights.
         """
         poses, width = world_from_scan, self.width
-        for _ in range(STEPS):
+        for step in range(STEPS):
+            progress("adjustment", step, STEPS)
             here = self.points.at(poses)
             planes = self._planes(here, width)
             if not len(planes.plane):
                 return poses
             poses, width = moved(poses, thinning_step(planes, here, poses)), self._width(planes)
+        progress("adjustment", STEPS, STEPS)
         return poses
 
     def _met(self, planes: Planes) -> Int[np.ndarray, "e 2"]:
@@ -141,10 +145,10 @@ class MapScore:
         thickness = self.surfaces.thickness(world_from_scan.matrix.detach().double().cpu().numpy())
         return self.alignment(world_from_scan) + THICKNESS_WEIGHT * thickness
 
-    def adjusted(self, world_from_scan: RigidMotion) -> RigidMotion:
+    def adjusted(self, world_from_scan: RigidMotion, progress: Progress = silent) -> RigidMotion:
         """The poses at which the map is thinnest, or the given ones where those score no worse."""
         start = world_from_scan.matrix.detach().double().cpu().numpy()
-        found = RigidMotion.from_matrix(torch.from_numpy(self.surfaces.adjusted(start)))
+        found = RigidMotion.from_matrix(torch.from_numpy(self.surfaces.adjusted(start, progress)))
         return found if self(found) < self(world_from_scan) else world_from_scan
 
 

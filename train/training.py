@@ -64,32 +64,33 @@ def train_map(
     """
     data = MappingData(scans, edges, start, config=config.training, seed=config.seed)
     module = build_module(data, config.training, seed=config.seed)
+    if not config.training.epochs:
+        return Trained(module.poses(data.every_scan()), module, {}, 0)
     score = MapScore(Alignment(data.prepared, edges), SurfaceMap(scans, data.prepared, start.matrix.double().numpy()))
-    if config.training.adjust and config.training.epochs:
-        data.start = score.adjusted(data.start)
+    if config.training.adjust:
+        data.start = score.adjusted(data.start, progress)
     best = KeepBest(score, data)
-    if config.training.epochs:
-        trainer = L.Trainer(
-            accelerator=config.device,
-            devices=1,
-            max_epochs=config.training.epochs,
-            callbacks=_callbacks(best, folder, progress),
-            logger=_loggers(folder),
-            reload_dataloaders_every_n_epochs=1,
-            log_every_n_steps=1,
-            fast_dev_run=fast_dev_run,
-            enable_checkpointing=folder is not None,
-            # Progress is reported through ``progress``, for the whole of the run in one place.
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        checkpoint = folder / "checkpoints" / LAST if folder is not None else None
-        found = checkpoint is not None and checkpoint.is_file()
-        with warnings.catch_warnings():
-            # Lightning 2.6 walks trees by a class that torch 2.13 renames; nothing for a user to act on.
-            warnings.filterwarnings("ignore", message=LEAF_SPEC, category=FutureWarning)
-            trainer.fit(module, data, ckpt_path=checkpoint if found else None)
-        best.restore(module)
+    trainer = L.Trainer(
+        accelerator=config.device,
+        devices=1,
+        max_epochs=config.training.epochs,
+        callbacks=_callbacks(best, folder, progress),
+        logger=_loggers(folder),
+        reload_dataloaders_every_n_epochs=1,
+        log_every_n_steps=1,
+        fast_dev_run=fast_dev_run,
+        enable_checkpointing=folder is not None,
+        # Progress is reported through ``progress``, for the whole of the run in one place.
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    checkpoint = folder / "checkpoints" / LAST if folder is not None else None
+    found = checkpoint is not None and checkpoint.is_file()
+    with warnings.catch_warnings():
+        # Lightning 2.6 walks trees by a class that torch 2.13 renames; nothing for a user to act on.
+        warnings.filterwarnings("ignore", message=LEAF_SPEC, category=FutureWarning)
+        trainer.fit(module, data, ckpt_path=checkpoint if found else None)
+    best.restore(module)
     return Trained(module.poses(data.every_scan()), module, best.curves, best.kept_epoch)
 
 

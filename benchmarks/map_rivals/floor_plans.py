@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from benchmarks.mapping_rows import METRES, Row
-from train.scans import ScanSet, planar_poses
-from train.simulate import WorldSettings, simulate
+from benchmarks.mapping_rows import METRES, Row, simulated
+from train.scans import ScanSet
+from train.simulate import WorldSettings
 
 PLANS = 20
 KINDS = ("rooms", "loop", "corridor")
@@ -20,9 +20,7 @@ def settings(seed: int) -> WorldSettings:
 
 def floor_plan(seed: int) -> ScanSet:
     """The scans in the frame of the first one."""
-    world = simulate(settings(seed))
-    truth = planar_poses(np.linalg.inv(world.world_from_scan[0]) @ world.world_from_scan, "truth")
-    return ScanSet(world.points, [str(i) for i in range(len(truth))], world.timestamps, truth=truth)
+    return simulated(settings(seed))
 
 
 def _name(seed: int) -> str:
