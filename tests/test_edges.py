@@ -176,6 +176,33 @@ def test_an_edge_that_the_graph_does_not_believe_is_registered_anew():
     assert found.source.tolist() == [1, 2, 3] and found.score[1] > 0.5
 
 
+@pytest.mark.parametrize(("rounds", "moving", "asked"), [(2, 0, 2), (2, 3, 4), (1, 100, 4), (0, 100, 0)])
+def test_loops_are_sought_on_while_scans_move_but_not_for_ever(monkeypatch, rounds, moving, asked):
+    scans, calls = _room(4), []
+
+    def none(scene, poses, edges, *rest, weights):
+        calls.append(0)
+        return edges.kept(edges.kind < 0)
+
+    def moved(edges, start):
+        poses, belief = solve_pose_graph(edges, start)
+        return RigidMotion(poses.rotation, poses.translation + 10.0 * (len(calls) <= moving)), belief
+
+    monkeypatch.setattr("train.edges.loops", none)
+    monkeypatch.setattr("train.edges.solve_pose_graph", moved)
+    monkeypatch.setattr("train.edges.refined", lambda full, scene, graph, poses, progress: poses)
+    register_edges(scans, EdgeConfig(window=2, points=180, rounds=rounds))
+    assert len(calls) == asked
+
+
+def test_normals_of_dense_scans_reach_over_more_neighbours(monkeypatch):
+    asked = []
+    monkeypatch.setattr("train.prepared.estimate_normals", lambda points, k: asked.append(k) or points)
+    for d, count in ((2, 20_000), (3, 500), (3, 10_000), (3, 100_000)):
+        prepare(ScanSet([np.random.default_rng(0).normal(size=(count, d))] * 2, ["a", "b"], np.arange(2.0)), 100)
+    assert asked[::2] == [6, 13, 20, 30]
+
+
 def test_a_loop_that_the_graph_does_not_believe_is_dropped(monkeypatch):
     scans, asked, doubted = _room(8), [], []
 
