@@ -29,9 +29,9 @@ class BBRLayer(nn.Module):
     ----------
     stages: ``Stage`` objects, each starting where the last one ended; or one of the paper's names ``"softBBS"``,
         ``"softBD"``, ``"N"``, ``"F"`` for a single scale-free stage. None: the measured default, softBBS then F.
-    starts: how many starting rotations the first stage tries as one batch, 1 or more; all stages then run from the one
-        that ended with most soft buddies. The gradient is that of this run; the choice has none.
-        ``BBRLayer.robust()`` tries 7, which costs about four times as much.
+    starts: how many starting rotations are tried as one batch, 1 or more, on as few points as the first stage sees. The
+        one kept ends with most buddies on each other's planes (softBBS without normals). The gradient is that of the
+        run from there; the choice has none. ``BBRLayer.robust()`` tries 7, which costs about five times as much.
     backward: how gradients reach the inputs: ``Replay()`` (default, exact), ``Truncated(last_steps)``,
         ``Implicit()``, ``Autograd()`` (second derivatives) or ``Detached()``.
     inner, temperature: settings of the one stage that is given by name.
@@ -161,8 +161,11 @@ class BBRLayer(nn.Module):
         frame, pair = prepared(given, needs_normals, self.scaled)
         motion = begun_at(start, pair, frame, self.scaled)
         stages = [stage for stage in self.sequence if stage.wanted(pair)]
+        steps = sum(stage.inner.steps for stage in stages)
         if self.starts > 1:
-            motion, stages[0] = best_start(self.starts, stages[0], (pair, frame), motion)
+            motion, stages[0], tried = best_start(self.starts, stages, (pair, frame), motion)
+            if tried is not None and not differentiable:
+                return judged(pair, frame, tried, steps)
         mode = self.backward_mode if differentiable else Detached()
         ended = descended(stages, (pair, frame), motion, mode)
         if isinstance(mode, Implicit):
@@ -171,7 +174,7 @@ class BBRLayer(nn.Module):
                 ended = descended(stages, (pair, frame), motion, Replay())
             elif doubt:
                 speak_up(mode, doubt)
-        return judged(pair, frame, ended, sum(stage.inner.steps for stage in stages))
+        return judged(pair, frame, ended, steps)
 
     def _wants_gradient(self, pair: CloudPair, start: RigidMotion | None) -> bool:
         settings = [x for m in self.modules() for x in vars(m).values() if isinstance(x, Tensor)]

@@ -49,7 +49,8 @@ ORDER = {
         inner.run inner.implicit
         backward transforms preparation
         stage
-        named_stages starts descent
+        named_stages descent
+        starts
         layer
         atomic cloud_columns
         cloud_tables cloud_formats cloud_writing trajectories

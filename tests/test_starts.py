@@ -6,11 +6,13 @@ import pytest
 import torch
 from problems import bumpy
 
-from bbr_layer import BBRLayer, CloudPair, Detached, RigidMotion, angular_error
+from bbr_layer import BBRLayer, CloudPair, Detached, RigidMotion, Stage, angular_error, hard_buddies
 from bbr_layer.inner.adam import Adam
+from bbr_layer.losses import BuddyFilter
 from bbr_layer.named_stages import named_stage
 from bbr_layer.preparation import prepared
-from bbr_layer.starts import HOT, TURN, best_start, most_starts, turns
+from bbr_layer.starts import HOT, TURN, best_start, most_starts, score, turns
+from benchmarks.paper_experiments import EXPERIMENTS
 
 
 def _turned(d, degrees, seed):
@@ -43,11 +45,11 @@ def test_only_other_starts_begin_hotter():
     P, Q, _ = _turned(3, 90, 1)
     frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
     begun = RigidMotion.identity(3, (1,))
-    far = best_start(7, named_stage("softBBS"), (pair, frame), begun)
+    far = best_start(7, [named_stage("softBBS")], (pair, frame), begun)
     assert not torch.equal(far.motion.rotation, begun.rotation)
     assert far.stage.temperature.start == HOT
-    assert best_start(7, named_stage("F"), (pair, frame), begun).stage.temperature.start == 0.3
-    easy = best_start(7, named_stage("softBBS"), (pair, frame), BBRLayer.robust(Detached())(P[None], Q[None])[0])
+    assert best_start(7, [named_stage("F")], (pair, frame), begun).stage.temperature.start == 0.3
+    easy = best_start(7, [named_stage("softBBS")], (pair, frame), BBRLayer.robust(Detached())(P[None], Q[None])[0])
     assert easy.stage.temperature.start == named_stage("softBBS").temperature.start
 
 
@@ -55,7 +57,46 @@ def test_the_chosen_stage_sees_as_few_points_as_it_was_to():
     P, Q, _ = _turned(3, 90, 1)
     frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
     stage = named_stage("softBBS", points=50)
-    assert best_start(7, stage, (pair, frame), RigidMotion.identity(3, (1,))).stage.points == 50
+    assert best_start(7, [stage], (pair, frame), RigidMotion.identity(3, (1,))).stage.points == 50
+
+
+class _Seen(Stage):
+    """F that notes how many points it saw, of how many pairs."""
+
+    def forward(self, pair, *rest, **named):
+        self.seen = tuple(pair.P.shape[:2])
+        return super().forward(pair, *rest, **named)
+
+
+def test_starts_are_compared_on_few_points_and_without_the_stages_for_many():
+    P, Q, _ = _turned(3, 90, 1)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    fine, large = _Seen(BuddyFilter(), Adam(3, 0.005)), _Seen(BuddyFilter(), Adam(3, 0.005), above=100)
+    best_start(7, [named_stage("softBBS", points=50), fine, large], (pair, frame), RigidMotion.identity(3, (1,)))
+    assert fine.seen[0] == 7 and 40 <= fine.seen[1] <= 50
+    assert not hasattr(large, "seen")
+
+
+def test_the_score_counts_buddies_on_each_others_planes():
+    P, Q, truth = _turned(3, 20, 3)
+    _, pair = prepared(CloudPair(P[None], Q[None]), True, False)
+    motion = RigidMotion(*(x[None] for x in truth))
+    moved, normals = motion(pair.Q)[0], motion.rotate(pair.Q_normals)[0]
+    spacing, wanted = pair.known_spacing().item(), 0.0
+    for i, j in hard_buddies(torch.cdist(pair.P[0], moved)).nonzero():
+        other = normals[j] * (1 if pair.P_normals[0, i] @ normals[j] >= 0 else -1)
+        offset = moved[j] - pair.P[0, i]
+        off_plane = offset @ (pair.P_normals[0, i] + other) / 2
+        wanted += math.exp(-((off_plane / (0.3 * spacing)) ** 2)) if offset.norm() < 2 * spacing else 0.0
+    assert score(pair, motion).item() == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", [21, 36])
+def test_scans_of_which_a_wrong_start_finds_nearly_as_many_buddies(seed, real_data):
+    fig7 = next(experiment for experiment in EXPERIMENTS if experiment.name == "fig7")
+    trial = fig7.cells("disjoint")[0].make(seed)
+    result = BBRLayer.robust(Detached())(trial.P, trial.Q)
+    assert trial.errors(result.target_from_source)[0] < 2
 
 
 def test_every_item_keeps_its_own_best():
@@ -75,6 +116,22 @@ def test_masked_points_and_weights_follow_their_item():
     result = BBRLayer.robust(Detached())(*padded, P_mask=mask, Q_mask=mask, Q_weights=torch.ones(200).double())
     plain = BBRLayer.robust(Detached())(P, Q)
     torch.testing.assert_close(result.target_from_source.matrix, plain.target_from_source.matrix, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("points", [None, 60])
+def test_the_answer_is_the_same_with_and_without_a_gradient(points):
+    P, Q, _ = _turned(3, 90, 1)
+    layer = BBRLayer(named_stage("softBBS", points=points), named_stage("F", Adam(20, 0.005)), starts=7)
+    with torch.no_grad():
+        plain = layer(P, Q)
+    kept = layer(P.clone().requires_grad_(), Q)
+    assert kept.target_from_source.rotation.requires_grad
+    for one, other in zip(plain, kept, strict=True):
+        if isinstance(one, torch.Tensor):
+            torch.testing.assert_close(one, other.detach(), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        plain.target_from_source.matrix, kept.target_from_source.matrix.detach(), atol=1e-9, rtol=0
+    )
 
 
 def test_the_gradient_is_that_of_the_run_from_the_chosen_start():

@@ -20,6 +20,7 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
+    share_of,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
@@ -113,7 +114,7 @@ def buddy_sum_rates(sides, normals, out, constants, kept):  # type: ignore[no-un
                         around = normal, (nx[j], ny[j], nz[j]), (mx[j], my[j], mz[j])
                         squared, half_rate = plane_square_rate((offset, velocity), around, align)
                     e, distance, _, distance_rate = measured_rate(seen, j, squared, half_rate, scales)
-                    buddies = (e * own_inverse) * (e * inverse[j])
+                    buddies = share_of(e, own_inverse) * share_of(e, inverse[j])
                     change = TWO * logit_rate(distance, distance_rate, scales[1], cool_rate) - own_rate - rate[j]
                     buddies_rate, length_rate = buddies * change, buddies * (change * distance + distance_rate)
                     a, b = a + buddies * weight[j], b + buddies * weight[j] * distance

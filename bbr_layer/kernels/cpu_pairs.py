@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from bbr_layer.kernels.cpu_math import ONE, TWO, ZERO, compiled, exp_negative
+from bbr_layer.kernels.cpu_math import ONE, TWO, ZERO, compiled, exp_negative, share_of
 
 
 @compiled(forceinline=True)
@@ -144,7 +144,7 @@ def slope(e, distance, row, column, loss):  # type: ignore[no-untyped-def]
 
     ``row`` and ``column`` are (weight, inverse denominator, share), ``loss`` is (1 / alpha, by S, by M).
     """
-    r, c = e * row[1], e * column[1]
+    r, c = share_of(e, row[1]), share_of(e, column[1])
     buddies = row[0] * column[0] * r * c
     by_logit = TWO * (loss[1] + loss[2] * distance) * buddies - r * row[2] - c * column[2]
     return by_logit, loss[2] * buddies - by_logit * loss[0]
@@ -164,7 +164,7 @@ def slope_rate(at, rates, row, column, loss):  # type: ignore[no-untyped-def]
     change of the denominator (relative) and of the share; ``loss`` with those of alpha (relative), by S and by M.
     """
     (e, distance), (rate, distance_rate) = at, rates
-    r, c = e * row[1], e * column[1]
+    r, c = share_of(e, row[1]), share_of(e, column[1])
     buddies = row[0] * column[0] * r * c
     r_rate, c_rate = rate - row[3], rate - column[3]
     buddies_rate = buddies * (r_rate + c_rate)

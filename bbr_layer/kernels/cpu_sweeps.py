@@ -18,6 +18,7 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
+    share_of,
 )
 from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, measured, plane_square, point_of, three
 
@@ -87,7 +88,7 @@ def buddy_sums(sides, normals, out, constants, kept):  # type: ignore[no-untyped
                     else:
                         squared = plane_square(offset, (normal, (nx[j], ny[j], nz[j])), align)
                     e, distance, _ = measured(seen, j, squared, scales)
-                    buddies = (e * row_inverse) * (e * inverse[j])
+                    buddies = share_of(e, row_inverse) * share_of(e, inverse[j])
                     row_count += buddies * weight[j]
                     row_lengths += buddies * weight[j] * distance
                     count[j] += buddies * own
