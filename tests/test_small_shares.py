@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 numba = pytest.importorskip("numba", reason="the compiled sweeps need numba")
-from bbr_layer.kernels.cpu_math import share_of  # noqa: E402
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT  # noqa: E402
+from bbr_layer.kernels.cpu_math import BY_S, COOL_RATE, share_of  # noqa: E402
 from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators  # noqa: E402
 
 SMALLEST_NORMAL = 2.0**-126
@@ -56,3 +57,16 @@ def test_sums_of_far_pairs_are_those_in_float64(spread):
         buddy_sums(sides, None, out, constants, None)
         found.append(np.concatenate((out[0][:2].ravel(), out[1][:2].ravel())))
     np.testing.assert_allclose(found[0], found[1], rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize("sweeps", [GRADIENT, DUAL], ids=["gradient", "rates"])
+@pytest.mark.parametrize("part", [1, 2])
+def test_no_sweep_multiplies_shares_below_the_smallest_number(sweeps, part):
+    """One pair 46 temperatures apart: e is 1e-20, and its square would be 1e-40."""
+    sides, constants, out = _tables(1, 0.0, np.float32)
+    sides[1][0] = 46.0
+    sides[1][8] = 1.0  # the column moves
+    constants[BY_S] = -1.0
+    constants[COOL_RATE] = 1.0
+    sweeps.parts[part](sides, None, out, constants, None)
+    assert not out[0].any() and not out[1].any()

@@ -99,6 +99,15 @@ def test_scans_of_which_a_wrong_start_finds_nearly_as_many_buddies(seed, real_da
     assert trial.errors(result.target_from_source)[0] < 2
 
 
+def test_a_start_without_a_score_is_not_chosen(monkeypatch):
+    P, Q, _ = _turned(3, 20, 0)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    scores = torch.tensor([torch.nan, 1.0, 2.0], dtype=torch.float64)
+    monkeypatch.setattr("bbr_layer.starts.score", lambda *_: scores)
+    found = best_start(3, [named_stage("F", Adam(2, 0.005))], (pair, frame), RigidMotion.identity(3, (1,)))
+    torch.testing.assert_close(found.motion.rotation[0], turns(3, 3)[2])
+
+
 def test_every_item_keeps_its_own_best():
     pairs = [_turned(3, 90, seed) for seed in (1, 2)]
     P, Q, truths = zip(*pairs, strict=True)

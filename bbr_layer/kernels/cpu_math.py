@@ -38,7 +38,7 @@ LOG2_E = F32(1 / math.log(2))
 EXP2 = tuple(F32(math.log(2) ** k / math.factorial(k)) for k in range(7))
 LOWEST_EXPONENT, EXPONENT_BIAS, MANTISSA_BITS = F32(-126.0), np.int32(127), np.int32(23)
 # Shares of a denominator below 2^-60 count as 0 in float32, lest their products fall below the smallest normal number
-# 2^-126, where many processors are slow by an order of magnitude. Lifted by 2^40, none is below that when compared.
+# 2^-126, at which many processors are slow. Lifted by 2^40, none is below that when compared.
 LIFT, LOWER, FAINT = F32(2.0**40), F32(2.0**-40), F32(2.0**-20)
 HALF, ZERO, ONE, TWO = F32(0.5), F32(0.0), F32(1.0), F32(2.0)
 
