@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import small_gicp
 import torch
 
 from benchmarks.kept import keep, kept_results
-from benchmarks.map_rivals.chain import along
+from benchmarks.map_rivals.chain import along, in_own_unit, reach
+from benchmarks.map_rivals.gicp import Setting, SmallGicp
 from benchmarks.mapping_rows import ROWS
 from benchmarks.mapping_table import map_errors
 from train.config import EdgeConfig
@@ -33,8 +33,8 @@ KINDS, OURS = {"GICP": "GICP", "PLANE_ICP": "point-to-plane"}, "ours"
 # Side of a voxel, in metres, and most points of a scan in our refinement.
 VOXELS, POINTS = (0.1, 0.2, 0.3, 0.5, 1.0), (2500, 5000, 10000, 20000)
 DEFAULT = str(EdgeConfig().refined_points)
-# Of small_gicp: farthest match in metres, neighbours of a normal, most steps, a step that counts as none (radians, m).
-GATE, NEIGHBOURS, STEPS, TIGHT = 1.0, 20, 100, 1e-6
+# Farthest match, in metres; the rest of small_gicp's settings is that of the rivals' bench.
+GATE = 1.0
 # By row and way: points of a scan, error and distance in metres, and of ours the poses.
 Results = dict[str, dict[str, dict[str, Any]]]
 
@@ -48,26 +48,11 @@ def ours(scans: ScanSet, most: int) -> tuple[float, np.ndarray]:
 
 def chained(scans: ScanSet, kind: str, voxel: float, begin: np.ndarray) -> tuple[float, np.ndarray]:
     """Points of a scan (median) and poses ``(k, 4, 4)`` along small_gicp's pairs, each begun at the poses given."""
-    clouds = [small_gicp.voxelgrid_sampling(points, voxel, num_threads=1) for points in scans.points]
-    trees = [small_gicp.KdTree(cloud, num_threads=1) for cloud in clouds]
-    for cloud, tree in zip(clouds, trees, strict=True):
-        small_gicp.estimate_normals_covariances(cloud, tree, NEIGHBOURS, num_threads=1)
-    motions = []
-    for i in range(len(clouds) - 1):
-        found = small_gicp.align(
-            clouds[i],
-            clouds[i + 1],
-            trees[i],
-            np.linalg.inv(begin[i]) @ begin[i + 1],
-            kind,
-            max_correspondence_distance=GATE,
-            num_threads=1,
-            max_iterations=STEPS,
-            rotation_epsilon=TIGHT,
-            translation_epsilon=TIGHT,
-        )
-        motions.append(np.asarray(found.T_target_source))
-    return float(np.median([cloud.size() for cloud in clouds])), along(np.stack(motions))
+    unit = reach(scans)
+    rival = SmallGicp(scans, kind, Setting(voxel / unit, (GATE / unit,), follow=False))
+    begin = in_own_unit(begin, 1 / unit)
+    motions = [rival.register(i, i + 1, np.linalg.inv(begin[i]) @ begin[i + 1]) for i in range(len(scans) - 1)]
+    return float(np.median([cloud.size() for cloud in rival.clouds])), in_own_unit(along(np.stack(motions)), unit)
 
 
 def measure(name: str, found: dict[str, dict[str, Any]], kept: Callable[[], None]) -> None:
@@ -110,7 +95,7 @@ def table(results: Results) -> str:
     """The whole text, the densest setting of each method first."""
     head = (
         "Made by `python -m benchmarks.voxels`, one thread. GICP and point-to-plane: small_gicp, each scan with the\n"
-        f"one before, **begun at our poses**, gate {GATE:g} m, at most {STEPS} steps. Points: of a scan, median.\n"
+        f"one before, **begun at our poses**, gate {GATE:g} m. Points: of a scan, median.\n"
         "Error: RMSE of the positions after rigid alignment, against the truth (of kitti00 a chain of point-to-plane\n"
         "ICP, of kitti07 the estimate of a SLAM); from ours: the same against our map of the default configuration.\n"
         "Metres.\n"
