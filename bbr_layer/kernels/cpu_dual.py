@@ -21,6 +21,7 @@ from bbr_layer.kernels.cpu_math import (
     ZERO,
     compiled,
     share_of,
+    wide_vectors,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
@@ -39,6 +40,7 @@ from bbr_layer.kernels.cpu_pairs import (
 @compiled()
 def denominator_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """Sums of exp(-D / alpha) and their rates: channels 0 and 1 of both ``out``."""
+    wide_vectors()
     rows, columns = sides
     scales, align, cool_rate = (constants[SMOOTH], constants[COOL]), constants[ALIGN], constants[COOL_RATE]
     sums = np.empty((2, columns.shape[1]), dtype=rows.dtype)
@@ -86,6 +88,7 @@ def weights_of(rows, i):  # type: ignore[no-untyped-def]
 @compiled()
 def buddy_sum_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """Sums of buddies and of buddies times distance, and the rates of the two: channels 0 to 3 of both ``out``."""
+    wide_vectors()
     rows, columns = sides
     scales, align, cool_rate = (constants[SMOOTH], constants[COOL]), constants[ALIGN], constants[COOL_RATE]
     sums = np.empty((4, columns.shape[1]), dtype=rows.dtype)

@@ -27,6 +27,7 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
+    wide_vectors,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
@@ -60,6 +61,7 @@ def row_rates(rows, i):  # type: ignore[no-untyped-def]
 @compiled()
 def point_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """``point_forces`` and their rates."""
+    wide_vectors()
     rows, columns = sides
     scales, loss = (constants[SMOOTH], constants[COOL]), loss_rates(constants)
     sums = np.empty((12, columns.shape[1]), dtype=rows.dtype)
@@ -87,8 +89,7 @@ def point_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-
                     factor_rate = (slopes[3] - factor * distance_rate) * over
                     heat += slopes[0] * distance
                     heat_rate += slopes[2] * distance + slopes[0] * distance_rate
-                    rounding += factor
-                    rounding_rate += factor_rate
+                    rounding, rounding_rate = rounding + factor, rounding_rate + factor_rate
                     x, y, z = scaled(offset, factor)
                     ax, ay, az = ax - x, ay - y, az - z
                     add_at(f, j, (x, y, z))

@@ -17,6 +17,7 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
+    wide_vectors,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
@@ -89,6 +90,7 @@ def add_products(out, row, vectors, pushed, signs):  # type: ignore[no-untyped-d
 @compiled()
 def plane_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """``plane_forces`` and their rates, nothing kept used: what each pair pushes, points and normals."""
+    wide_vectors()
     rows, columns = sides
     scales, loss = (constants[SMOOTH], constants[ALIGN]), loss_rates(constants)
     buffer = np.ones((4, min(TILE, columns.shape[1])), dtype=rows.dtype)

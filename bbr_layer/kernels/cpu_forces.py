@@ -17,6 +17,7 @@ from bbr_layer.kernels.cpu_math import (
     WEIGHT,
     ZERO,
     compiled,
+    wide_vectors,
 )
 from bbr_layer.kernels.cpu_pairs import (
     add_at,
@@ -39,6 +40,7 @@ def point_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyp
 
     Channels ``HEAT`` and ``ROUND`` of ``out[0]``: sums of dL/du D and of dL/dD / D, for temperature and rounding.
     """
+    wide_vectors()
     rows, columns = sides
     scales, loss = (constants[SMOOTH], constants[COOL]), (constants[COOL], constants[BY_S], constants[BY_M])
     sums = np.empty((3, columns.shape[1]), dtype=rows.dtype)
@@ -74,6 +76,7 @@ def point_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyp
 @compiled()
 def plane_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """The gradient of a point-to-plane loss: as ``point_forces``, and the derivatives by normals in channels 3 to 5."""
+    wide_vectors()
     rows, columns = sides
     scales, align = (constants[SMOOTH], constants[COOL]), constants[ALIGN]
     loss = constants[COOL], constants[BY_S], constants[BY_M]

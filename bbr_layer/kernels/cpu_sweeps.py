@@ -19,6 +19,7 @@ from bbr_layer.kernels.cpu_math import (
     ZERO,
     compiled,
     share_of,
+    wide_vectors,
 )
 from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, measured, plane_square, point_of, three
 
@@ -26,6 +27,7 @@ from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, measured, plane_s
 @compiled()
 def denominators(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """Sums of exp(-D / alpha): per row into ``out[0][0]``, per column into ``out[1][0]``."""
+    wide_vectors()
     rows, columns = sides
     scales, align = (constants[SMOOTH], constants[COOL]), constants[ALIGN]
     sums = np.empty((1, columns.shape[1]), dtype=rows.dtype)
@@ -62,6 +64,7 @@ def denominators(sides, normals, out, constants, kept):  # type: ignore[no-untyp
 @compiled()
 def buddy_sums(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """Sums of buddies and of buddies times distance, weighted by the other side: channels 0 and 1 of both ``out``."""
+    wide_vectors()
     rows, columns = sides
     scales, align = (constants[SMOOTH], constants[COOL]), constants[ALIGN]
     sums = np.empty((2, columns.shape[1]), dtype=rows.dtype)
