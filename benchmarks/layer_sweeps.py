@@ -13,7 +13,7 @@ from bbr_layer import Adam, BBRLayer, Replay
 from bbr_layer.kernels import cpu
 from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, room_to_keep
 from bbr_layer.kernels.cpu_items import Loss
-from bbr_layer.kernels.cpu_math import FAST, exp_negative
+from bbr_layer.kernels.cpu_math import FAST, exp_negative, wide_vectors
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 from bbr_layer.pair import CloudPair
 from benchmarks.layer_problems import clouds
@@ -49,6 +49,7 @@ def best(function: Callable[[], object], inner: int) -> float:
 @numba.njit(fastmath=FAST, error_model="numpy")
 def exp_root(x, out):  # type: ignore[no-untyped-def]
     """exp(-sqrt(x)), the core of every sweep."""
+    wide_vectors()
     for _ in range(100):
         for i in range(x.size):
             out[i] += exp_negative(-np.sqrt(x[i]))
@@ -57,6 +58,7 @@ def exp_root(x, out):  # type: ignore[no-untyped-def]
 @numba.njit(fastmath=FAST, error_model="numpy")
 def divide(x, out):  # type: ignore[no-untyped-def]
     """A division per number."""
+    wide_vectors()
     for _ in range(100):
         for i in range(x.size):
             out[i] += np.float32(1) / x[i]
@@ -65,6 +67,7 @@ def divide(x, out):  # type: ignore[no-untyped-def]
 @numba.njit(fastmath=FAST, error_model="numpy")
 def multiply_add(x, out):  # type: ignore[no-untyped-def]
     """Ten fused multiply-adds per number, in a chain that other numbers' chains overlap with."""
+    wide_vectors()
     a = np.float32(0.999)
     for _ in range(100):
         for i in range(x.size):
