@@ -25,8 +25,8 @@ from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 from bbr_layer.pair import CloudPair
 
 # Where padded points are put, and how long their normals are: so far from everything, along every axis, that nothing
-# of them reaches a sum: their exponential is 1e-35 in float32, and the square of their distance times that, over the
-# default epsilon of Eq. 4, stays below 1e-8.
+# of them reaches a sum. In float32 their exponential is 1e-35: over the smallest epsilon below, a share that counts as
+# 0, and in a denominator, even 1e8 times over as its rate, nothing beside that epsilon.
 FAR, LONG_NORMAL = 1e8, 10.0
 # The smallest epsilon of Eq. 4 that sums of float32 exponentials can be added to without subtracting a maximum first.
 SMALLEST_OUTLIER = 1e-12

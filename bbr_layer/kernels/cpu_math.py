@@ -113,7 +113,7 @@ def _wide_vectors(typing_context):  # type: ignore[no-untyped-def]
     """Called in a function: let it use vectors of 512 bits where the processor has them.
 
     LLVM keeps to 256 bits on many processors that have 512, for the sake of code that uses them here and there; the
-    sweeps do nothing else. Its effect is in the sweeps' rows of python -m benchmarks.layer.
+    sweeps do nothing else.
     """
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
