@@ -33,7 +33,7 @@ def nearest_neighbours(
 def listed(tree: Tree, count: int) -> Int[Tensor, "n count"]:
     """The same for all points of a tree, from the lists that it keeps."""
     index = tree.lists()[1][:, :count].astype(np.int64)
-    return torch.from_numpy(np.pad(index, ((0, 0), (0, count - index.shape[1])), mode="edge"))
+    return torch.from_numpy(_filled(index, count))
 
 
 def known_tree(points: Tensor, number: int) -> Tree | None:
@@ -63,4 +63,10 @@ def neighbours_of(
         index = (tree or Tree(searched)).candidates(asked, enough)[1]
     else:
         index = cKDTree(searched).query(asked, k=list(range(1, enough + 1)))[1]
-    return torch.from_numpy(np.pad(index, ((0, 0), (0, count - enough)), mode="edge")).to(points.device)
+    return torch.from_numpy(_filled(index, count)).to(points.device)
+
+
+def _filled(index: Int[np.ndarray, "k found"], count: int) -> Int[np.ndarray, "k count"]:
+    """Up to ``count`` columns, the last one repeated."""
+    missing = count - index.shape[1]
+    return np.concatenate((index, *(index[:, -1:],) * missing), axis=1) if missing else index

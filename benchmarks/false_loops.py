@@ -21,6 +21,7 @@ from bbr_layer import RigidMotion
 from benchmarks.kept import keep, kept_results
 from benchmarks.mapping_rows import ROWS, Row
 from benchmarks.mapping_table import map_errors
+from train.agreement import agreed_poses
 from train.config import EdgeConfig
 from train.edges import refined, register_edges
 from train.loops import DOUBTED
@@ -53,7 +54,7 @@ class Solver:
         """The map of edges of which the last ``wrong`` are wrong, from the poses of the chain and the window."""
         sure = edges.kept(edges.kind < 2)
         begin, _ = solve_pose_graph(sure, spanning_poses(edges.kept(edges.kind == 0), len(self.scans)))
-        poses, belief = solve_pose_graph(edges, begin)
+        poses, belief = agreed_poses(self.scene, edges, (begin,))
         found = refined(self.full, self.scene, (edges, belief), poses, silent).matrix.numpy()
         error = map_errors(found, self.scans, self.row)[self.row.error]
         return Solved(error, int((belief[len(belief) - wrong :] > DOUBTED).sum()))

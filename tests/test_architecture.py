@@ -89,6 +89,7 @@ ORDER = {
         pair_registration outputs
         chain
         recognition given_motion loops
+        agreement
         edges
         known_edges
         groups schedule

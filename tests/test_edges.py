@@ -184,12 +184,12 @@ def test_loops_are_sought_on_while_scans_move_but_not_for_ever(monkeypatch, roun
         calls.append(0)
         return edges.kept(edges.kind < 0)
 
-    def moved(edges, start):
-        poses, belief = solve_pose_graph(edges, start)
+    def moved(scene, edges, starts):
+        poses, belief = solve_pose_graph(edges, starts[0])
         return RigidMotion(poses.rotation, poses.translation + 10.0 * (len(calls) <= moving)), belief
 
     monkeypatch.setattr("train.edges.loops", none)
-    monkeypatch.setattr("train.edges.solve_pose_graph", moved)
+    monkeypatch.setattr("train.edges.agreed_poses", moved)
     monkeypatch.setattr("train.edges.refined", lambda full, scene, graph, poses, progress: poses)
     register_edges(scans, EdgeConfig(window=2, points=180, rounds=rounds))
     assert len(calls) == asked

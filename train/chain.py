@@ -10,7 +10,7 @@ from bbr_layer import RigidMotion
 from train.pair_registration import better, by_features, register_pairs, softly
 from train.pose_graph import Edges
 from train.scans import Progress, ScanSet
-from train.scene import Scene
+from train.scene import Scene, apart
 
 # An edge whose score is below this part of the chain's median is sought again from other starts.
 POOR = 0.6
@@ -34,7 +34,7 @@ def consecutive(scene: Scene, scans: ScanSet, progress: Progress) -> Edges:
     if scene.features:
         edges = better(edges, by_features(scene, (target, target + 1), 0, progress))
     likely = _motions_around(edges.target_from_source)
-    unlike = _apart(scene, edges, likely) > UNLIKE * scene.spacing
+    unlike = apart(scene, edges.source, edges.target_from_source, likely) > UNLIKE * scene.spacing
     edges = _tried(edges, unlike, lambda few, rows: _from(scene, few, likely.item(rows), progress))
     poor = edges.score < POOR * edges.score.median()
     return _tried(edges, poor, lambda few, rows: _from_turned_starts(scene, few, start.item(rows), progress))
@@ -75,13 +75,6 @@ def _motions_around(motion: RigidMotion) -> RigidMotion:
         around.append(vectors[rows].median(0).values if rows else vectors[edge])
     found = torch.stack(around)
     return RigidMotion.from_rotvec(found[:, :-d], found[:, -d:])
-
-
-def _apart(scene: Scene, edges: Edges, other: RigidMotion) -> Tensor:
-    """Root mean square distance between the source's points under the edges' motion and under the other, ``(e,)``."""
-    clouds = [torch.from_numpy(scene.surfaces[number].points) for number in edges.source.tolist()]
-    moves = [edges.target_from_source.item(edge)(cloud) - other.item(edge)(cloud) for edge, cloud in enumerate(clouds)]
-    return torch.stack([move.square().sum(-1).mean().sqrt() for move in moves])
 
 
 def _from_turned_starts(scene: Scene, edges: Edges, start: RigidMotion, progress: Progress) -> Edges:

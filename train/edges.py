@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer import RigidMotion
+from train.agreement import agreed_poses
 from train.chain import POOR, all_pairs, consecutive
 from train.config import EdgeConfig
 from train.free_space_evidence import point_evidence
@@ -79,7 +80,7 @@ def _closed(scene: Scene, graph: Graph, config: EdgeConfig, progress: Progress) 
         edges = again(scene, edges, belief, poses, weights)
         edges = edges.kept((edges.kind != 2) | (belief >= DOUBTED))
         edges = edges.joined(loops(scene, poses, edges, config, progress, weights=weights))
-        poses, belief = solve_pose_graph(edges, poses)
+        poses, belief = agreed_poses(scene, edges, (poses, graph[1]))
         moved = torch.linalg.vector_norm(poses.translation - before.translation, dim=-1).max()
         if turn + 1 >= config.rounds and moved < scene.spacing:
             break

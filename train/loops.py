@@ -52,11 +52,9 @@ def loops(
 ) -> Edges:
     """Scans that the poses put close together though far apart in time, not joined yet, as far as they agree."""
     places = poses.translation.numpy()
-    prepared = scene.prepared
-    radius = torch.linalg.vector_norm(prepared.points, dim=-1)[prepared.mask].median().item()
     joined = set(zip(edges.target.tolist(), edges.source.tolist(), strict=True))
     pairs = []
-    for i, near in enumerate(cKDTree(places).query_ball_point(places, LOOP_REACH * radius)):
+    for i, near in enumerate(cKDTree(places).query_ball_point(places, reach(scene))):
         distances = np.linalg.norm(places - places[i], axis=1)
         later = sorted((j for j in near if j >= i + apart_in_time(config)), key=distances.__getitem__)
         spread = later[:: max(1, len(later) // max(config.loops_per_scan, 1))]
@@ -67,6 +65,12 @@ def loops(
     start = poses.item(target).inverse() @ poses.item(source)
     found = register_pairs(scene, (target, source), start, 2, progress, weights=weights)
     return found.kept(found.score >= LOOP_SCORE * edges.score[edges.kind == 0].median())
+
+
+def reach(scene: Scene) -> float:
+    """How near each other the places of two scans lie that may see the same, in the data's unit."""
+    points, _, mask = scene.prepared
+    return LOOP_REACH * torch.linalg.vector_norm(points, dim=-1)[mask].median().item()
 
 
 def point_weights(scene: Scene, edges: Edges, poses: RigidMotion) -> PointWeights:

@@ -20,6 +20,8 @@ from bbr_layer import RigidMotion
 # Graduation: the kernel starts so wide that nothing is an outlier and narrows by this factor per round.
 NARROWING = 1.6
 START_WIDTH = 64.0
+# The same where the start is taken to be nearly right: edges that lead far from it then hardly bend it at first.
+NEAR_WIDTH = 16.0
 # Rounds at the final width: each lets the median forget more of the outliers.
 SETTLING_ROUNDS = 8
 # Final kernel width in medians of the whitened residuals; about 3 standard deviations of a Gaussian.
@@ -93,23 +95,23 @@ def spanning_poses(edges: Edges, scans: int) -> RigidMotion:
     return RigidMotion(*(torch.stack(field) for field in zip(*(poses[scan] for scan in range(scans)), strict=True)))
 
 
-def solve_pose_graph(edges: Edges, start: RigidMotion) -> tuple[RigidMotion, Tensor]:
+def solve_pose_graph(edges: Edges, start: RigidMotion, *, near: bool = False) -> tuple[RigidMotion, Tensor]:
     """Poses that the edges agree on, and how much each edge was believed, ``(e,)`` in [0, 1].
 
     Parameters
     ----------
     edges: at least a chain.
     start: ``world_from_scan (k, ...)`` to begin at; the first is kept.
+    near: the start is nearly right; edges that it contradicts count little from the first step on.
     """
     root = _information_root(edges)
-    poses, weights = start, torch.ones(len(edges.target), dtype=torch.float64)
-    typical = torch.linalg.vector_norm(edges.target_from_source.translation, dim=-1).median()
-    for width in _graduation():
+    widths = _graduation(NEAR_WIDTH if near else START_WIDTH)
+    alike = torch.ones(len(edges.target), dtype=torch.float64)
+    poses, weights = start, _weights(edges, start, root, widths[0]) if near else alike
+    for width in widths:
         for _ in range(STEPS_PER_ROUND):
             poses = _gauss_newton(edges, poses, root, weights)
-        sizes = torch.linalg.vector_norm(_residuals(edges, poses, root), dim=-1)
-        scale = sizes.median().clamp(min=RESIDUAL_FLOOR * float(typical))
-        weights = (1 + (sizes / (width * FINAL_WIDTH * scale)).square()).pow(-2)
+        weights = _weights(edges, poses, root, width)
     return poses, weights
 
 
@@ -120,10 +122,18 @@ def disagreement(motion: RigidMotion, edges: Edges) -> Tensor:
     return torch.cat((turn, shift), -1)
 
 
-def _graduation() -> list[float]:
+def _graduation(widest: float) -> list[float]:
     """Kernel widths, narrowing to 1 and staying there while the scale of the inliers settles."""
-    rounds = math.ceil(math.log(START_WIDTH) / math.log(NARROWING))
-    return [START_WIDTH / NARROWING**turn for turn in range(rounds)] + [1.0] * SETTLING_ROUNDS
+    rounds = math.ceil(math.log(widest) / math.log(NARROWING))
+    return [widest / NARROWING**turn for turn in range(rounds)] + [1.0] * SETTLING_ROUNDS
+
+
+def _weights(edges: Edges, poses: RigidMotion, root: Tensor, width: float) -> Tensor:
+    """Geman-McClure's weight of each edge, the kernel ``width`` times its final width."""
+    sizes = torch.linalg.vector_norm(_residuals(edges, poses, root), dim=-1)
+    typical = torch.linalg.vector_norm(edges.target_from_source.translation, dim=-1).median()
+    scale = sizes.median().clamp(min=RESIDUAL_FLOOR * float(typical))
+    return (1 + (sizes / (width * FINAL_WIDTH * scale)).square()).pow(-2)
 
 
 def _information_root(edges: Edges) -> Tensor:

@@ -77,3 +77,10 @@ def _score(scene: Scene, pair: tuple[int, int], motion: Float[np.ndarray, "d1 d1
     )
     against = [float(view.saw_through(points).mean()) for view, points in views if view is not None]
     return float(agree * np.exp(-CONTRADICTION * np.mean(against))) if against else float(agree)
+
+
+def apart(scene: Scene, source: Tensor, motion: RigidMotion, other: RigidMotion) -> Float[Tensor, " e"]:
+    """Root mean square distance between the points of scans ``source`` ``(e,)`` under two motions ``(e, ...)``."""
+    clouds = [torch.from_numpy(scene.surfaces[number].points) for number in source.tolist()]
+    moves = [motion.item(edge)(cloud) - other.item(edge)(cloud) for edge, cloud in enumerate(clouds)]
+    return torch.stack([move.square().sum(-1).mean().sqrt() for move in moves])

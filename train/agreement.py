@@ -1,0 +1,87 @@
+"""Poses from edges of which some are wrong: of several solutions the one whose poses make the scans agree best.
+
+The robust pose graph has many minima, and which one it finds hangs on the order in which edges lose their weight. Begun
+wide, it forgives a start that is far off, but every wrong edge bends the poses at first. Begun near a start, each edge
+as strong as its score, it holds on to a good start, and clings to a bad one. The scans say which is right, those above
+all that no edge joins: an edge speaks for itself.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from bbr_layer import RigidMotion
+from train.given_motion import GIVEN
+from train.loops import reach
+from train.pose_graph import Edges, solve_pose_graph
+from train.scene import Scene, apart, scores
+
+# An edge at this share of the median score or below still pulls as one at this share does.
+FAINTEST = 0.05
+# Witnesses of a solution: each scan with its nearest ones, and at most so many pairs in all.
+NEAREST, MOST = 16, 300
+# What a pair counts that an edge joins, another one counting 1: the edge's own motion was sought for its score.
+JOINED = 0.5
+# Solutions that place the two scans of a pair within so many point spacings of each other are alike to it.
+ALIKE = 1.0
+
+
+def agreed_poses(scene: Scene, edges: Edges, starts: Sequence[RigidMotion]) -> tuple[RigidMotion, Tensor]:
+    """Poses that the edges agree on, and how much each edge was believed, ``(e,)`` in [0, 1].
+
+    Parameters
+    ----------
+    scene: the scans.
+    edges: at least a chain.
+    starts: ``world_from_scan (k, ...)`` to begin at, the likeliest first; the first pose is kept.
+    """
+    scored = _by_score(edges)
+    solutions = [solve_pose_graph(edges, starts[0])] + [solve_pose_graph(scored, one, near=True) for one in starts]
+    pairs, weight = _witnesses(scene, edges, [poses for poses, _ in solutions])
+    if not len(weight):
+        return solutions[0]
+    agreement = [float(weight @ scores(scene, pairs, _between(poses, pairs))) for poses, _ in solutions]
+    return solutions[agreement.index(max(agreement))]
+
+
+def _by_score(edges: Edges) -> Edges:
+    """The edges, each as strong as the square of its score over the median; given motions as they are."""
+    registered = edges.kind != GIVEN
+    share = (edges.score / edges.score[registered].median().clamp(min=1e-300)).clamp(min=FAINTEST)
+    strength = torch.where(registered, share, 1.0).square()
+    return edges._replace(information=strength[:, None, None] * edges.information)
+
+
+def _witnesses(
+    scene: Scene, edges: Edges, solutions: Sequence[RigidMotion]
+) -> tuple[tuple[Tensor, Tensor], Float[Tensor, " w"]]:
+    """Pairs of scans that are near each other in a solution, or joined, and not placed alike by all; their weights."""
+    registered = edges.kept(edges.kind != GIVEN)
+    joined = set(zip(registered.target.tolist(), registered.source.tolist(), strict=True))
+    pairs = sorted(joined.union(*(_near(scene, poses) for poses in solutions)))
+    target, source = torch.tensor(pairs).unbind(1)
+    weight = torch.tensor([JOINED if pair in joined else 1.0 for pair in pairs], dtype=torch.float64)
+    motions = [_between(poses, (target, source)) for poses in solutions]
+    away = torch.stack([apart(scene, source, motion, motions[0]) for motion in motions[1:]]).amax(0)
+    differ = torch.nonzero(away > ALIKE * scene.spacing)[:, 0]
+    some = differ[torch.linspace(0, len(differ) - 1, min(len(differ), MOST)).round().long()]
+    return (target[some], source[some]), weight[some]
+
+
+def _near(scene: Scene, poses: RigidMotion) -> set[tuple[int, int]]:
+    """Each scan with the scans nearest to it, the earlier one first."""
+    places = poses.translation.numpy()
+    ranks = list(range(2, min(NEAREST + 1, len(places)) + 1))  # the first is the scan itself
+    close, partner = cKDTree(places).query(places, k=ranks, distance_upper_bound=reach(scene))
+    first, rank = np.nonzero(np.isfinite(close))
+    pairs = np.sort(np.stack((first, partner[first, rank]), 1), axis=1)
+    return {(int(i), int(j)) for i, j in pairs if i != j}
+
+
+def _between(poses: RigidMotion, pairs: tuple[Tensor, Tensor]) -> RigidMotion:
+    """``target_from_source`` of the pairs."""
+    return poses.item(pairs[0]).inverse() @ poses.item(pairs[1])
