@@ -2,9 +2,10 @@
 
     python -m benchmarks.paper --peers --repeats 20 --out docs
 
-The whole takes about an hour. Every registration is kept in the results file as soon as its cell is done: a run that
-was cut off goes on where it was, and tables and pictures are drawn from what is there. ``--only fig3`` runs one
-experiment, ``--draw`` none. The peers want ``pip install '.[peers]'``.
+The whole takes two to three hours, more than half of them for the paper's own variants. Every registration is kept in
+the results file as soon as its cell is done: a run that was cut off goes on where it was, and tables and pictures are
+drawn from what is there. ``--only fig3`` runs one experiment, ``--draw`` none. The peers want
+``pip install '.[peers]'``.
 """
 
 import argparse
@@ -29,7 +30,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--sampling", nargs="+", choices=SAMPLINGS, default=SAMPLINGS)
     parser.add_argument("--peers", action="store_true", help="run the peers too")
     parser.add_argument("--repeats", type=int, default=20, help="twice as many in Figs. 6 and 7, half for lidar")
-    parser.add_argument("--variant-repeats", type=int, default=3, help="of the paper's four variants, which are slow")
+    parser.add_argument("--variant-repeats", type=int, default=20, help="of the paper's four variants, which are slow")
     parser.add_argument("--draw", action="store_true", help="run nothing, only write what the results file holds")
     parser.add_argument("--results", type=Path, default=Path("out/paper_results.json"))
     parser.add_argument("--out", type=Path, default=Path("docs"))

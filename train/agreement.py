@@ -27,7 +27,7 @@ NEAREST, MOST = 16, 300
 # What a pair counts that an edge joins, another one counting 1: the edge's own motion was sought for its score.
 JOINED = 0.5
 # Solutions that place the two scans of a pair within so many point spacings of each other are alike to it.
-ALIKE = 1.0
+ALIKE = 0.3
 
 
 def agreed_poses(scene: Scene, edges: Edges, starts: Sequence[RigidMotion]) -> tuple[RigidMotion, Tensor]:
