@@ -57,14 +57,24 @@ def test_of_several_starts_the_one_that_the_scans_agree_with_is_held_on_to():
     assert _off(agreed_poses(SCENE, edges, (far, TRUTH))[0]) < 1e-6
 
 
+def test_edges_that_are_all_met_are_not_doubted(monkeypatch):
+    solved = []
+    monkeypatch.setattr(agreement, "solve_pose_graph", lambda *of, **how: solved.append(how) or solve_pose_graph(*of))
+    poses, belief = agreed_poses(SCENE, true_edges(SCANS), (displaced(TRUTH, 0.02), TRUTH))
+    assert _off(poses) < 1e-6 and belief.min() > 0.9
+    assert solved == [{}]
+
+
 def test_solutions_that_are_alike_are_not_compared(monkeypatch):
     def never(*_):
         raise AssertionError("asked for scores of solutions that are alike")
 
     monkeypatch.setattr(agreement, "scores", never)
     edges = true_edges(SCANS)
-    poses, belief = agreed_poses(SCENE, edges, (displaced(TRUTH, 0.02),))
-    assert _off(poses) < 1e-6 and belief.min() > 0.9
+    one = edges.kept(torch.tensor([5]))
+    wrong = RigidMotion(one.target_from_source.rotation, one.target_from_source.translation + 1.0)
+    poses, belief = agreed_poses(SCENE, edges.joined(one._replace(target_from_source=wrong)), (TRUTH,))
+    assert _off(poses) < 1e-6 and belief[:-1].min() > 0.9 > 0.01 > belief[-1]
 
 
 def test_given_motions_keep_their_strength_and_are_not_asked(monkeypatch):

@@ -26,7 +26,7 @@ FAINTEST = 0.05
 NEAREST, MOST = 16, 300
 # What a pair counts that an edge joins, another one counting 1: the edge's own motion was sought for its score.
 JOINED = 0.5
-# Solutions that place the two scans of a pair within so many point spacings of each other are alike to it.
+# Motions that place the two scans of a pair within so many point spacings of each other are alike.
 ALIKE = 0.3
 
 
@@ -39,13 +39,23 @@ def agreed_poses(scene: Scene, edges: Edges, starts: Sequence[RigidMotion]) -> t
     edges: at least a chain.
     starts: ``world_from_scan (k, ...)`` to begin at, the likeliest first; the first pose is kept.
     """
-    scored = _by_score(edges)
-    solutions = [solve_pose_graph(edges, starts[0])] + [solve_pose_graph(scored, one, near=True) for one in starts]
+    wide, scored = solve_pose_graph(edges, starts[0]), _by_score(edges)
+    if not _contradicted(scene, edges, wide[0]):
+        return wide
+    solutions = [wide] + [solve_pose_graph(scored, one, near=True) for one in starts]
     pairs, weight = _witnesses(scene, edges, [poses for poses, _ in solutions])
     if not len(weight):
-        return solutions[0]
+        return wide
     agreement = [float(weight @ scores(scene, pairs, _between(poses, pairs))) for poses, _ in solutions]
     return solutions[agreement.index(max(agreement))]
+
+
+def _contradicted(scene: Scene, edges: Edges, poses: RigidMotion) -> bool:
+    """Whether the poses leave a registered edge; where they meet all, there is nothing to doubt."""
+    registered = edges.kept(edges.kind != GIVEN)
+    motion = _between(poses, (registered.target, registered.source))
+    away = apart(scene, registered.source, motion, registered.target_from_source)
+    return bool((away > ALIKE * scene.spacing).any())
 
 
 def _by_score(edges: Edges) -> Edges:
