@@ -29,8 +29,8 @@ what the paper leaves open.
   The lowest median of all but the paper's variants is bold. **s** is processor seconds per registration in the last
   column's trials, normals and trees included where the method makes them.
 - **Repeats**: {repeats} per cell, {twice} in Figs. 6 and 7, {half} per lidar pair. The paper's own variants,
-  `BBRLayer.paper(...)`, take seconds to a minute each and have at most {variants} (N {slow}, which tells a basin and
-  not a percentage), in some places, shared sampling only, at most 500 points.
+  `BBRLayer.paper(...)`, take seconds to a minute each and have at most {variants} (N {slow}), in some places, shared
+  sampling only, at most 500 points; their brackets say how many. Fewer than 20 tell a basin, not a percentage.
 - **Ours**: `BBRLayer()`, `BBRLayer.fast()` and `BBRLayer.robust()` without any argument; on lidar also
   `BBRLayer("F")`, the paper's loss alone. Lidar scans are thinned to {all} points as in the paper, for FPFH + RANSAC
   to {features}.
@@ -105,7 +105,8 @@ def _row(bench: Bench, method: Method, scores: list[Scores | None], best: list[f
         median, high = np.median(found.degrees), np.quantile(found.degrees, 0.9)
         bold = "**" if median == lowest and method.kind != "variant" else ""
         failed = found.failed(bench.experiment)
-        cells.append(f"{bold}{median:.3f}{bold} / {high:.3f}" + (f" ({failed})" if failed else ""))
+        words = f"{failed} of {len(found.degrees)}" if method.kind == "variant" else f"{failed}" if failed else ""
+        cells.append(f"{bold}{median:.3f}{bold} / {high:.3f}" + (f" ({words})" if words else ""))
     seconds = next(np.mean(x.seconds) for x in reversed(scores) if x is not None)
     return f"| {method.name} | " + " | ".join([*cells, f"{seconds:.2f}"]) + " |"
 
