@@ -117,6 +117,6 @@ def in_space(points: Float[np.ndarray, "*rows d"]) -> Float[np.ndarray, "*rows 3
     """Points of the plane at height 0, which changes no distance; points of space as they are."""
     if points.shape[-1] == 3:
         return points
-    placed = np.zeros((*points.shape[:-1], 3), points.dtype)  # np.pad takes ten times as long for a few hundred points
+    placed = np.zeros((*points.shape[:-1], 3), points.dtype)  # np.pad costs more than the search of a few points
     placed[..., : points.shape[-1]] = points
     return placed

@@ -65,6 +65,19 @@ def test_edges_that_are_all_met_are_not_doubted(monkeypatch):
     assert solved == [{}]
 
 
+def test_all_that_is_near_and_placed_otherwise_is_a_witness_and_what_an_edge_joins_counts_less():
+    edges = true_edges(SCANS)
+    edges = edges.kept(edges.kind == 0)
+    other = RigidMotion(TRUTH.rotation, TRUTH.translation.clone())
+    other.translation[12:] += 1.0
+    (target, source), weight = agreement._witnesses(SCENE, edges, [TRUTH, other])
+    pairs = list(zip(target.tolist(), source.tolist(), strict=True))
+    joined = set(zip(edges.target.tolist(), edges.source.tolist(), strict=True))
+    near = agreement._near(SCENE, TRUTH) | agreement._near(SCENE, other)
+    assert set(pairs) == {(i, j) for i, j in joined | near if i < 12 <= j}
+    assert near - joined and weight.tolist() == [0.5 if pair in joined else 1.0 for pair in pairs]
+
+
 def test_solutions_that_are_alike_are_not_compared(monkeypatch):
     def never(*_):
         raise AssertionError("asked for scores of solutions that are alike")

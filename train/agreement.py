@@ -85,11 +85,10 @@ def _witnesses(
 def _near(scene: Scene, poses: RigidMotion) -> set[tuple[int, int]]:
     """Each scan with the scans nearest to it, the earlier one first."""
     places = poses.translation.numpy()
-    ranks = list(range(2, min(NEAREST + 1, len(places)) + 1))  # the first is the scan itself
-    close, partner = cKDTree(places).query(places, k=ranks, distance_upper_bound=reach(scene))
+    close, partner = cKDTree(places).query(places, k=NEAREST + 1, distance_upper_bound=reach(scene))
     first, rank = np.nonzero(np.isfinite(close))
     pairs = np.sort(np.stack((first, partner[first, rank]), 1), axis=1)
-    return {(int(i), int(j)) for i, j in pairs if i != j}
+    return {(int(i), int(j)) for i, j in pairs if i != j}  # each scan is among its own nearest
 
 
 def _between(poses: RigidMotion, pairs: tuple[Tensor, Tensor]) -> RigidMotion:

@@ -80,7 +80,8 @@ def _closed(scene: Scene, graph: Graph, config: EdgeConfig, progress: Progress) 
         edges = again(scene, edges, belief, poses, weights)
         edges = edges.kept((edges.kind != 2) | (belief >= DOUBTED))
         edges = edges.joined(loops(scene, poses, edges, config, progress, weights=weights))
-        poses, belief = agreed_poses(scene, edges, (poses, graph[1]))
+        starts = (poses, graph[1]) if turn else (poses,)  # the same ones in the first round
+        poses, belief = agreed_poses(scene, edges, starts)
         moved = torch.linalg.vector_norm(poses.translation - before.translation, dim=-1).max()
         if turn + 1 >= config.rounds and moved < scene.spacing:
             break

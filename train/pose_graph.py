@@ -106,8 +106,8 @@ def solve_pose_graph(edges: Edges, start: RigidMotion, *, near: bool = False) ->
     """
     root = _information_root(edges)
     widths = _graduation(NEAR_WIDTH if near else START_WIDTH)
-    alike = torch.ones(len(edges.target), dtype=torch.float64)
-    poses, weights = start, _weights(edges, start, root, widths[0]) if near else alike
+    weights = _weights(edges, start, root, widths[0]) if near else torch.ones(len(edges.target), dtype=torch.float64)
+    poses = start
     for width in widths:
         for _ in range(STEPS_PER_ROUND):
             poses = _gauss_newton(edges, poses, root, weights)
