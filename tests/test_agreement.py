@@ -67,7 +67,7 @@ def test_edges_that_are_all_met_are_not_doubted(monkeypatch):
 
 def test_all_that_is_near_and_placed_otherwise_is_a_witness_and_what_an_edge_joins_counts_less():
     edges = true_edges(SCANS)
-    edges = edges.kept(edges.kind == 0)
+    edges = edges.kept(edges.kind == 1)  # consecutive scans are near each other and not joined
     other = RigidMotion(TRUTH.rotation, TRUTH.translation.clone())
     other.translation[12:] += 1.0
     (target, source), weight = agreement._witnesses(SCENE, edges, [TRUTH, other])
