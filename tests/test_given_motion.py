@@ -12,7 +12,8 @@ from small_worlds import true_edges, true_poses, world_of
 from bbr_layer import RigidMotion
 from train.config import EdgeConfig
 from train.edges import register_edges
-from train.given_motion import GIVEN, RIGHT_TO, clear, with_given, without_given
+from train.given_motion import FAR, GIVEN, RIGHT_TO, clear, with_given, without_given
+from train.pose_graph import Edges
 from train.scans import ScanSet
 from train.simulate import WorldSettings
 
@@ -84,3 +85,26 @@ def test_edges_that_found_nothing_leave_and_given_ones_are_told_apart():
     belief = torch.arange(len(both.score)).double()
     registered, theirs = without_given(both, belief)
     assert (registered.kind == 0).all() and theirs.tolist() == list(range(SCANS - 1 - 3))
+
+
+@pytest.mark.parametrize(("score", "deviations", "kept"), [(0.5, 2 * FAR, False), (0.8, 2 * FAR, True), (0.5, 1, True)])
+def test_an_edge_far_from_the_given_motion_stays_only_where_it_scores_well(score, deviations, kept):
+    scans, lost = _carried(), 4
+    chain = true_edges(scans)
+    chain = chain.kept(chain.kind == 0)
+    scores = torch.full_like(chain.score, 0.6)
+    scores[[0, 2, 6, 8, 10, 12, 14, 16, 18]] = 0.8
+    scores[lost] = score
+    slips = 0.02 * deviations  # radians; the odometry's own slips have this deviation
+    start = RigidMotion.from_matrix(torch.from_numpy(scans.start))
+    given = start.item(torch.tensor([lost])).inverse() @ start.item(torch.tensor([lost + 1]))
+    turn = RigidMotion.from_rotvec(torch.tensor([[slips]]).double(), torch.zeros(1, 2).double())
+    chain.target_from_source.rotation[lost] = (turn.rotation @ given.rotation)[0]
+    chain.target_from_source.translation[lost] = given.translation[0]
+    found = without_given(*_believed(with_given(chain._replace(score=scores), scans, spacing=0.1)))[0]
+    assert (lost in found.target.tolist()) == kept
+    assert len(found.target) == SCANS - 1 - (not kept), "the others stay"
+
+
+def _believed(edges: Edges) -> tuple[Edges, torch.Tensor]:
+    return edges, torch.ones(len(edges.target))

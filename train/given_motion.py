@@ -15,6 +15,9 @@ from train.scans import ScanSet
 GIVEN = 3
 # An edge whose score is below this part of the chain's median found nothing.
 FAINT = 0.3
+# So far from the given motion, in standard deviations, a neighbour's edge must at least score as the median does: a scan
+# that shares little with the one before finds another place to fit.
+FAR = 8.0
 # A registered edge is taken to be right to this part of a point spacing, against which the given ones are weighed.
 RIGHT_TO = 0.1
 # From the median of absolute values to the standard deviation of a Gaussian.
@@ -47,7 +50,8 @@ def with_given(edges: Edges, scans: ScanSet, spacing: float) -> Edges:
         score=torch.zeros_like(edges.score),
         kind=torch.full_like(edges.kind, GIVEN),
     )
-    return clear(edges, edges).joined(given)
+    far = (disagreement(motion, edges).abs() > FAR * scatter).any(-1) & ~good
+    return clear(edges.kept(~far), edges).joined(given)
 
 
 def clear(edges: Edges, chain: Edges) -> Edges:
