@@ -14,6 +14,9 @@ from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
 # Points of each cloud that soft buddies are sought among, whose cost grows with the square: on streets 1000 lead to
 # where F goes on (benchmarks/lidar.md). The fast ones trade basin for time: benchmarks/solvers.md.
 SOFT_POINTS, FAST_SOFT_POINTS = 1000, 300
+# Points of each cloud that F begins on: its basin is as wide as the points are sparse. Without this stage two objects
+# that moved apart (docs/experiments.md, Fig. 5, 900 points) fail twice as often.
+FIRST_POINTS = 1000
 # Points of each cloud that most of F's steps see; the last few see all. Chosen: a twelfth of a full lidar scan.
 FINE_POINTS = 10_000
 
@@ -21,17 +24,20 @@ FINE_POINTS = 10_000
 def default_stages(soft_points: int = SOFT_POINTS) -> list[Stage]:
     """Soft buddies for the basin, then hard ones on planes for the accuracy; scale-free, measured.
 
-    Of more than 10 000 points the first steps see fewer, and the last 30 all.
+    Of more than 1000 points F sees as many at first; of more than 10 000 it then sees those, and all in the last 30
+    steps.
     """
+    first = named_stage("F", points=FIRST_POINTS, above=FIRST_POINTS)
     last = named_stage("F", Adam(30, 0.001), above=FINE_POINTS)
-    return [named_stage("softBBS", points=soft_points), named_stage("F", points=FINE_POINTS), last]
+    return [named_stage("softBBS", points=soft_points), first, named_stage("F", points=FINE_POINTS), last]
 
 
 def fast_stages(soft_points: int = FAST_SOFT_POINTS) -> list[Stage]:
     """The same with soft buddies of fewer points and Gauss-Newton instead of most steps."""
     soft = named_stage("softBBS", Adam(40, 0.1), points=soft_points)
+    first = named_stage("F", GaussNewton(8), points=FIRST_POINTS, above=FIRST_POINTS)
     last = named_stage("F", GaussNewton(3), Annealed(0.1, 0.03), above=FINE_POINTS)
-    return [soft, named_stage("F", GaussNewton(8), points=FINE_POINTS), last]
+    return [soft, first, named_stage("F", GaussNewton(8), points=FINE_POINTS), last]
 
 
 def named_stage(
