@@ -59,6 +59,16 @@ def test_a_ray_sees_through_what_stands_well_before_its_end():
     assert not view.saw_through(points * 0.5 + 1e3).any()  # where no ray went
 
 
+def test_a_scan_looked_where_its_rays_ended_at_whatever_distance():
+    scans = _hall(walks=False)[0]
+    half = ScanSet([points[: RAYS // 2] for points in scans.points], scans.names, scans.timestamps)  # y above 0
+    view = range_views(half, surfaces(prepare(half, RAYS)))[0]
+    assert view is not None
+    for share in (0.1, 1.0, 10.0):
+        looked = view.looked_at(share * scans.points[0])
+        assert looked[: RAYS // 2].all() and looked[RAYS // 2 :].sum() < 10
+
+
 def test_a_witness_that_found_a_point_did_not_see_through_it(monkeypatch):
     scans, _ = _hall(walks=False)
     edges = true_edges(scans)

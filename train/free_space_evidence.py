@@ -32,13 +32,20 @@ class RangeView:
     ranges: Float[np.ndarray, "n"]
     gap: float
 
+    def looked_at(self, points: Float[np.ndarray, "m d"]) -> Bool[np.ndarray, "m"]:
+        """Whether a ray ended in the direction of each of ``points``, given in its own frame, at whatever distance."""
+        return self.tree.query(_directions(points))[0] < NEAR_GAPS * self.gap
+
     def saw_through(self, points: Float[np.ndarray, "m d"]) -> Bool[np.ndarray, "m"]:
         """Whether its rays went on beyond each of ``points``, given in its own frame."""
-        far = np.linalg.norm(points, axis=1)
         rays = min(RAYS, len(self.ranges))
-        apart, near = self.tree.query(points / np.maximum(far, 1e-300)[:, None], k=list(range(1, rays + 1)))
+        apart, near = self.tree.query(_directions(points), k=list(range(1, rays + 1)))
         shortest = self.ranges[near].min(axis=1)
-        return (apart[:, -1] < NEAR_GAPS * self.gap) & (far < (1 - BEYOND) * shortest)
+        return (apart[:, -1] < NEAR_GAPS * self.gap) & (np.linalg.norm(points, axis=1) < (1 - BEYOND) * shortest)
+
+
+def _directions(points: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
+    return points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-300)
 
 
 def range_views(scans: ScanSet, thinned: Sequence[Surface]) -> list[RangeView | None]:

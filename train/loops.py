@@ -18,6 +18,9 @@ LOOP_SCORE = 0.8
 # Loop candidates lie within this part of the median scan radius of each other, and this many windows apart in time.
 LOOP_REACH = 0.5
 LOOP_WINDOWS = 3
+# Two scans are tried as a loop where each looked in the direction of this part of the other's points: of 2367 pairs of
+# the Intel Research Lab's log that look away from each other more, 3 became loops.
+LOOKED_AT = 0.4
 # Edges that the graph believes less are sought again from its poses, and count in the refinement only above this.
 DOUBTED = 0.3
 
@@ -59,12 +62,23 @@ def loops(
         later = sorted((j for j in near if j >= i + apart_in_time(config)), key=distances.__getitem__)
         spread = later[:: max(1, len(later) // max(config.loops_per_scan, 1))]
         pairs += [(i, j) for j in spread[: config.loops_per_scan] if (i, j) not in joined]
+    pairs = [pair for pair in pairs if _look_at_each_other(scene, poses, pair)]
     if not pairs:
         return edges.kept(edges.kind < 0)
     target, source = torch.tensor(pairs).unbind(1)
     start = poses.item(target).inverse() @ poses.item(source)
     found = register_pairs(scene, (target, source), start, 2, progress, weights=weights)
     return found.kept(found.score >= LOOP_SCORE * edges.score[edges.kind == 0].median())
+
+
+def _look_at_each_other(scene: Scene, poses: RigidMotion, pair: tuple[int, int]) -> bool:
+    """Whether both scans looked to where the other's points are; True where nothing is seen from the origin."""
+    for here, there in (pair, pair[::-1]):
+        view, points = scene.views[here], torch.from_numpy(scene.surfaces[there].points)
+        placed = (poses.item(here).inverse() @ poses.item(there))(points).numpy()
+        if view is not None and view.looked_at(placed).mean() < LOOKED_AT:
+            return False
+    return True
 
 
 def reach(scene: Scene) -> float:
