@@ -1,5 +1,6 @@
 """What the command line shows: progress while it works, and where everything is when it is done."""
 
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from train.scans import Progress as Report
 
 # The exit code that command lines give to wrong arguments.
 BAD_INPUT = 2
+# Where there is no terminal, a stage that goes on is told of again after so many seconds: a log is read, not watched.
+SECONDS_APART = 10.0
 # What a person looks for in the folder of a map, in this order; files that a run did not write are left out.
 SHOWN = {
     "trajectory": ("poses_tum.txt", "poses_kitti.txt", "poses.npz"),
@@ -55,7 +58,10 @@ def one_sentence() -> Iterator[None]:
 
 @contextmanager
 def shown_progress(console: Console) -> Iterator[Report]:
-    """A bar for each stage of the work; yields what is to be told."""
+    """A bar for each stage of the work, lines where there is no terminal; yields what is to be told."""
+    if not console.is_terminal:
+        yield _in_lines(console)
+        return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
@@ -66,6 +72,22 @@ def shown_progress(console: Console) -> Iterator[Report]:
             bars.update(tasks[stage], completed=done, total=total)
 
         yield report
+
+
+def _in_lines(console: Console) -> Report:
+    """A line when a stage begins, and one every ten seconds while the work goes on."""
+    begun = last = time.monotonic()
+    told = set()
+
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if stage not in told or now - last >= SECONDS_APART:
+            told.add(stage)
+            last = now
+            console.print(f"{now - begun:6.0f} s  {stage} {done}/{total}", highlight=False)
+
+    return report
 
 
 def show_map(console: Console, out: Path, mapped: Mapped, unit: PrintedUnit) -> None:

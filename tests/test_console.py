@@ -1,0 +1,53 @@
+"""Progress is shown wherever the output goes: bars on a terminal, now and then a line in a log."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from train import console as module
+from train.console import shown_progress
+
+
+class Clock:
+    """Seconds that pass when the test says so."""
+
+    def __init__(self):
+        self.seconds = 100.0
+
+    def monotonic(self) -> float:
+        return self.seconds
+
+
+@pytest.fixture
+def clock(monkeypatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+def test_a_log_gets_a_line_for_every_stage_and_one_every_ten_seconds(clock):
+    log = io.StringIO()
+    with shown_progress(Console(file=log, width=80)) as report:
+        for done in range(4):
+            report("window", done, 4)
+            clock.seconds += 6.0
+        report("loops", 0, 90)
+        report("window", 4, 4)
+        clock.seconds += module.SECONDS_APART
+        report("loops", 32, 90)
+        assert "loops 32/90" in log.getvalue(), "told at once, not at the end"
+    assert log.getvalue().splitlines() == [
+        "     0 s  window 0/4",
+        "    12 s  window 2/4",
+        "    24 s  loops 0/90",
+        "    34 s  loops 32/90",
+    ]
+
+
+def test_a_terminal_gets_bars():
+    screen = io.StringIO()
+    with shown_progress(Console(file=screen, force_terminal=True, width=80)) as report:
+        report("window", 1, 4)
+        report("window", 4, 4)
+    assert "window" in screen.getvalue() and "4/4" in screen.getvalue() and "━" in screen.getvalue()
