@@ -74,6 +74,10 @@ class RigidMotion(NamedTuple):
         """Index the batch dimensions (an int, slice, mask or index tensor)."""
         return RigidMotion(self.rotation[index], self.translation[index])
 
+    def between(self, target: int | Tensor, source: int | Tensor) -> "RigidMotion":
+        """``target_from_source`` of pairs of these poses, by their numbers; all of them lead to one world."""
+        return self.item(target).inverse() @ self.item(source)
+
     def to(self, target: torch.dtype | torch.device | str) -> "RigidMotion":
         """Another dtype or device."""
         return RigidMotion(self.rotation.to(target), self.translation.to(target))

@@ -99,8 +99,8 @@ def _group(
     shift = torch.from_numpy(random.uniform(-2 * reach, 2 * reach, size=d))
     wrong = RigidMotion.from_rotvec(turn, shift)
     steps = range(size)
-    to_target = [poses.item(i + step).inverse() @ poses.item(i) for step in steps]
-    from_source = [poses.item(j).inverse() @ poses.item(j + step) for step in steps]
+    to_target = [poses.between(i + step, i) for step in steps]
+    from_source = [poses.between(j, j + step) for step in steps]
     return [(i + step, j + step, to_target[step] @ wrong @ from_source[step]) for step in steps]
 
 

@@ -140,4 +140,4 @@ def checked_progress(fraction: float) -> float:
 def relative_poses(world_from_scan: RigidMotion, batch: ScanBatch) -> RigidMotion:
     """``target_from_source`` of each edge as the poses have it, ``(e, ...)``."""
     target, source = batch.edges.unbind(1)
-    return world_from_scan.item(target).inverse() @ world_from_scan.item(source)
+    return world_from_scan.between(target, source)

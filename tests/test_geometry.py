@@ -77,3 +77,17 @@ def test_errors_measure_angle_and_distance(d):
     assert angular_error(first.rotation, motion(d, 0.4 + math.pi).rotation).item() == pytest.approx(math.pi)
     expected = 0.1 * math.sqrt(d)
     assert translation_error(first.translation, second.translation).item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_motion_between_two_poses_leads_through_their_world(d):
+    poses = RigidMotion(*(torch.stack(parts) for parts in zip(*(motion(d, 0.3 * k) for k in range(4)), strict=True)))
+    poses = RigidMotion(poses.rotation, torch.randn(4, d, dtype=torch.float64))
+    points = torch.randn(5, d, dtype=torch.float64)
+    target, source = torch.tensor([0, 3, 2]), torch.tensor([1, 1, 2])
+    found = poses.between(target, source)
+    for row, (i, j) in enumerate(zip(target.tolist(), source.tolist(), strict=True)):
+        in_world = poses.item(j)(points)
+        torch.testing.assert_close(poses.item(i)(found.item(row)(points)), in_world)
+        torch.testing.assert_close(poses.between(i, j).matrix, found.item(row).matrix)
+    torch.testing.assert_close(found.item(2).matrix, torch.eye(d + 1, dtype=torch.float64))

@@ -46,14 +46,14 @@ def agreed_poses(scene: Scene, edges: Edges, starts: Sequence[RigidMotion]) -> t
     pairs, weight = _witnesses(scene, edges, [poses for poses, _ in solutions])
     if not len(weight):
         return wide
-    agreement = [float(weight @ scores(scene, pairs, _between(poses, pairs))) for poses, _ in solutions]
+    agreement = [float(weight @ scores(scene, pairs, poses.between(*pairs))) for poses, _ in solutions]
     return solutions[agreement.index(max(agreement))]
 
 
 def _contradicted(scene: Scene, edges: Edges, poses: RigidMotion) -> bool:
     """Whether the poses leave a registered edge; where they meet all, there is nothing to doubt."""
     registered = edges.kept(edges.kind != GIVEN)
-    motion = _between(poses, (registered.target, registered.source))
+    motion = poses.between(registered.target, registered.source)
     away = apart(scene, registered.source, motion, registered.target_from_source)
     return bool((away > ALIKE * scene.spacing).any())
 
@@ -75,7 +75,7 @@ def _witnesses(
     pairs = sorted(joined.union(*(_near(scene, poses) for poses in solutions)))
     target, source = torch.tensor(pairs).unbind(1)
     weight = torch.tensor([JOINED if pair in joined else 1.0 for pair in pairs], dtype=torch.float64)
-    motions = [_between(poses, (target, source)) for poses in solutions]
+    motions = [poses.between(target, source) for poses in solutions]
     away = torch.stack([apart(scene, source, motion, motions[0]) for motion in motions[1:]]).amax(0)
     differ = torch.nonzero(away > ALIKE * scene.spacing)[:, 0]
     some = differ[torch.linspace(0, len(differ) - 1, min(len(differ), MOST)).round().long()]
@@ -89,8 +89,3 @@ def _near(scene: Scene, poses: RigidMotion) -> set[tuple[int, int]]:
     first, rank = np.nonzero(np.isfinite(close))
     pairs = np.sort(np.stack((first, partner[first, rank]), 1), axis=1)
     return {(int(i), int(j)) for i, j in pairs if i != j}  # each scan is among its own nearest
-
-
-def _between(poses: RigidMotion, pairs: tuple[Tensor, Tensor]) -> RigidMotion:
-    """``target_from_source`` of the pairs."""
-    return poses.item(pairs[0]).inverse() @ poses.item(pairs[1])

@@ -29,7 +29,7 @@ def consecutive(scene: Scene, scans: ScanSet, progress: Progress) -> Edges:
     start = RigidMotion.identity(scans.dimension, (len(target),))
     if scans.start is not None:
         world = RigidMotion.from_matrix(torch.from_numpy(scans.start))
-        start = world.item(target).inverse() @ world.item(target + 1)
+        start = world.between(target, target + 1)
     edges = register_pairs(scene, (target, target + 1), start, 0, progress)
     if scene.features:
         edges = better(edges, by_features(scene, (target, target + 1), 0, progress))

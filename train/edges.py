@@ -62,7 +62,7 @@ def _window(scene: Scene, scans: ScanSet, config: EdgeConfig, progress: Progress
     pairs = [(i, i + step) for step in range(2, config.window + 1) for i in range(len(scans) - step)]
     if pairs:
         target, source = torch.tensor(pairs).unbind(1)
-        start = poses.item(target).inverse() @ poses.item(source)
+        start = poses.between(target, source)
         found = register_pairs(scene, (target, source), start, 1, progress)
         edges = edges.joined(found if scans.start is None else clear(found, chain))
         poses, belief = solve_pose_graph(edges, poses)

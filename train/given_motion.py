@@ -40,7 +40,7 @@ def with_given(edges: Edges, scans: ScanSet, spacing: float) -> Edges:
     """
     assert scans.start is not None
     world = RigidMotion.from_matrix(torch.from_numpy(scans.start))
-    motion = world.item(edges.target).inverse() @ world.item(edges.source)
+    motion = world.between(edges.target, edges.source)
     good = edges.score >= edges.score.median()
     scatter = GAUSSIAN * disagreement(motion, edges)[good].abs().median(0).values
     registered = edges.information[good].diagonal(dim1=-2, dim2=-1).median(0).values

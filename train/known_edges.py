@@ -68,7 +68,7 @@ def neighbouring(scans: ScanSet, world_from_scan: RigidMotion, config: EdgeConfi
     return Edges(
         target=target,
         source=source,
-        target_from_source=world_from_scan.item(target).inverse() @ world_from_scan.item(source),
+        target_from_source=world_from_scan.between(target, source),
         information=torch.eye(size, dtype=torch.float64).expand(len(target), size, size).clone(),
         centre=torch.from_numpy(np.stack([points.mean(axis=0) for points in scans.points]))[source],
         score=torch.ones(len(target), dtype=torch.float64),

@@ -36,7 +36,7 @@ def again(scene: Scene, edges: Edges, belief: Tensor, poses: RigidMotion, weight
     if not len(doubted):
         return edges
     few = edges.kept(doubted)
-    start = poses.item(few.target).inverse() @ poses.item(few.source)
+    start = poses.between(few.target, few.source)
     found = register_pairs(scene, (few.target, few.source), start, 1, weights=weights)._replace(kind=few.kind)
     rest = torch.ones(len(edges.score), dtype=torch.bool)
     rest[doubted] = False
@@ -66,7 +66,7 @@ def loops(
     if not pairs:
         return edges.kept(edges.kind < 0)
     target, source = torch.tensor(pairs).unbind(1)
-    start = poses.item(target).inverse() @ poses.item(source)
+    start = poses.between(target, source)
     found = register_pairs(scene, (target, source), start, 2, progress, weights=weights)
     return found.kept(found.score >= LOOP_SCORE * edges.score[edges.kind == 0].median())
 
@@ -75,7 +75,7 @@ def _look_at_each_other(scene: Scene, poses: RigidMotion, pair: tuple[int, int])
     """Whether both scans looked to where the other's points are; True where nothing is seen from the origin."""
     for here, there in (pair, pair[::-1]):
         view, points = scene.views[here], torch.from_numpy(scene.surfaces[there].points)
-        placed = (poses.item(here).inverse() @ poses.item(there))(points).numpy()
+        placed = poses.between(here, there)(points).numpy()
         if view is not None and view.looked_at(placed).mean() < LOOKED_AT:
             return False
     return True

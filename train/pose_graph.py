@@ -146,7 +146,7 @@ def _information_root(edges: Edges) -> Tensor:
 
 def _residuals(edges: Edges, poses: RigidMotion, root: Tensor) -> Tensor:
     """Whitened disagreement of each edge: turn, and displacement of the source's centre, ``(e, k)``."""
-    apart = disagreement(poses.item(edges.target).inverse() @ poses.item(edges.source), edges)
+    apart = disagreement(poses.between(edges.target, edges.source), edges)
     return (root.mT @ apart[..., None])[..., 0]
 
 

@@ -9,7 +9,7 @@ from train.pair_registration import register_pairs
 from train.places import alike
 from train.pose_graph import Edges
 from train.scans import Progress
-from train.scene import Scene
+from train.scene import Scene, apart
 
 # Most key scans, spread evenly over the sequence, and how many of the likest pairs are registered, per key scan.
 KEYS, PAIRS_PER_KEY = 48, 2
@@ -22,8 +22,8 @@ NEAR_KEYS, SAME = 3, 5.0
 WITNESSES, SHARE = 3, 0.2
 
 
-def recognised(scene: Scene, edges: Edges, poses: RigidMotion, apart: int, progress: Progress) -> Edges:
-    """Loops between planar scans at least ``apart`` numbers from each other, whatever the poses say of them.
+def recognised(scene: Scene, edges: Edges, poses: RigidMotion, later: int, progress: Progress) -> Edges:
+    """Loops between planar scans at least ``later`` numbers from each other, whatever the poses say of them.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def recognised(scene: Scene, edges: Edges, poses: RigidMotion, apart: int, progr
     """
     step = -(-len(scene.surfaces) // KEYS)
     keys = list(range(0, len(scene.surfaces), step))
-    likeness = alike(scene, keys, apart, progress)
+    likeness = alike(scene, keys, later, progress)
     few = slice(PAIRS_PER_KEY * len(keys))
     pairs = likeness.target[few], likeness.source[few]
     if not len(pairs[0]):
@@ -55,11 +55,10 @@ def witnesses(scene: Scene, loops: Edges, poses: RigidMotion, near: int) -> Tens
         close = ((loops.target - i).abs() <= near) & ((loops.source - j).abs() <= near)
         close[loop] = False
         others = loops.kept(close)
-        forth = poses.item(torch.full_like(others.target, i)).inverse() @ poses.item(others.target)
-        back = poses.item(others.source).inverse() @ poses.item(torch.full_like(others.source, j))
+        forth = poses.between(torch.full_like(others.target, i), others.target)
+        back = poses.between(others.source, torch.full_like(others.source, j))
         led = forth @ others.target_from_source @ back
-        cloud = torch.from_numpy(scene.surfaces[j].points)
-        apart = led(cloud.expand(len(others.target), -1, -1)) - loops.target_from_source.item(loop)(cloud)
-        same = apart.square().sum(-1).mean(-1).sqrt() < SAME * scene.spacing
-        counts.append(same.sum())
+        this = loops.target_from_source.item(torch.full_like(others.target, loop))
+        away = apart(scene, torch.full_like(others.source, j), led, this)
+        counts.append((away < SAME * scene.spacing).sum())
     return torch.stack(counts) if counts else torch.zeros(0, dtype=torch.int64)

@@ -83,4 +83,4 @@ def apart(scene: Scene, source: Tensor, motion: RigidMotion, other: RigidMotion)
     """Root mean square distance between the points of scans ``source`` ``(e,)`` under two motions ``(e, ...)``."""
     clouds = [torch.from_numpy(scene.surfaces[number].points) for number in source.tolist()]
     moves = [motion.item(edge)(cloud) - other.item(edge)(cloud) for edge, cloud in enumerate(clouds)]
-    return torch.stack([move.square().sum(-1).mean().sqrt() for move in moves])
+    return torch.tensor([move.square().sum(-1).mean().sqrt().item() for move in moves], dtype=torch.float64)
