@@ -73,6 +73,17 @@ def test_a_large_pair_goes_through_all_stages_and_a_small_one_leaves_the_last_ou
         assert angular_error(result.target_from_source.rotation, truth.rotation) < 0.02
 
 
+@pytest.mark.parametrize("layer", [BBRLayer(backward=Detached()), BBRLayer.fast(Detached())], ids=["default", "fast"])
+def test_f_begins_on_1000_points_where_there_are_more(layer):
+    soft, first, then, last = layer.sequence
+    truth, P = motion(3, 0.05, 0.01), bumpy(1010, 3)
+    for count, stages in ((1000, (soft, then)), (1001, (soft, first, then))):
+        result = layer(P[:count], truth.inverse()(P[:count]))
+        assert result.iterations.item() == sum(stage.inner.steps for stage in stages)
+        assert angular_error(result.target_from_source.rotation, truth.rotation) < 1e-3
+    assert first.points == first.above == 1000 and repr(first.loss) == repr(then.loss)
+
+
 def test_settings_of_a_stage_that_cannot_work_are_refused(as_a_user):
     with pytest.raises(ValueError, match="points is many; a stage needs"):
         Stage(BuddyFilter(), points="many")
