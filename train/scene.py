@@ -25,13 +25,16 @@ CONTRADICTION = 5.0
 class Scene(NamedTuple):
     """k scans, thinned: padded for the layer, with trees, and what each saw by direction.
 
-    ``features``: of each scan's points, in space only; empty in the plane.
+    ``features``: of each scan's points, in space only; empty in the plane. ``middle (k, d)``, ``scatter (k, d, d)``:
+    mean and covariance of each scan's points.
     """
 
     prepared: Prepared
     surfaces: list[Surface]
     views: list[RangeView | None]
     features: list[Float[np.ndarray, "n 33"]]
+    middle: Float[Tensor, "k d"]
+    scatter: Float[Tensor, "k d d"]
 
     @property
     def spacing(self) -> float:
@@ -46,7 +49,10 @@ def build_scene(scans: ScanSet, prepared: Prepared) -> Scene:
     if scans.dimension == 3:
         radius, view = RADIUS * float(np.median([scan.spacing for scan in found])), common_view(found)
         features = [shape_features(scan, radius, view) for scan in found]
-    return Scene(prepared, found, range_views(scans, found), features)
+    middle = np.stack([scan.points.mean(axis=0) for scan in found])
+    scatter = np.stack([np.cov(scan.points.T, bias=True) for scan in found])
+    moments = torch.from_numpy(middle), torch.from_numpy(scatter)
+    return Scene(prepared, found, range_views(scans, found), features, *moments)
 
 
 def scores(scene: Scene, pairs: tuple[Tensor, Tensor], target_from_source: RigidMotion) -> Float[Tensor, " e"]:
@@ -81,6 +87,7 @@ def _score(scene: Scene, pair: tuple[int, int], motion: Float[np.ndarray, "d1 d1
 
 def apart(scene: Scene, source: Tensor, motion: RigidMotion, other: RigidMotion) -> Float[Tensor, " e"]:
     """Root mean square distance between the points of scans ``source`` ``(e,)`` under two motions ``(e, ...)``."""
-    clouds = [torch.from_numpy(scene.surfaces[number].points) for number in source.tolist()]
-    moves = [motion.item(edge)(cloud) - other.item(edge)(cloud) for edge, cloud in enumerate(clouds)]
-    return torch.tensor([move.square().sum(-1).mean().sqrt().item() for move in moves], dtype=torch.float64)
+    turn, shift = motion.rotation - other.rotation, motion.translation - other.translation
+    of_middle = (turn @ scene.middle[source][:, :, None])[:, :, 0] + shift
+    about_it = torch.einsum("eab,ebc,eac->e", turn, scene.scatter[source], turn)
+    return (of_middle.square().sum(-1) + about_it).clamp(min=0).sqrt()
