@@ -23,11 +23,16 @@ def hard_buddies(
     distances: ``(*batch, n, m)``, from ``P[i]`` to ``Q[j]``. Of equal distances the first counts.
     mask: True where both points are real.
 
+    Raises
+    ------
+    ValueError: a mask that is not boolean.
+
     >>> hard_buddies(torch.tensor([[0.1, 0.5], [0.2, 0.9]]))
     tensor([[ True, False],
             [False, False]])
     """
     if mask is not None:
+        _check_mask(mask)
         distances = torch.where(mask, distances, torch.inf)
     n, m = distances.shape[-2:]
     rows = torch.arange(n, device=distances.device)[:, None]
@@ -40,7 +45,7 @@ def hard_buddies(
 
 def soft_buddies(
     distances: Float[Tensor, "*batch n m"],
-    temperature: Float[Tensor, "*batch"],
+    temperature: Float[Tensor, "*batch"] | float,
     outlier: float = OUTLIER_CONSTANT,
     mask: Bool[Tensor, "*batch n m"] | None = None,
 ) -> Float[Tensor, "*batch n m"]:
@@ -52,17 +57,31 @@ def soft_buddies(
     Parameters
     ----------
     distances: ``(*batch, n, m)``, not negative.
-    temperature: ``(*batch,)`` alpha, in the unit of the distances.
+    temperature: ``(*batch,)`` alpha, in the unit of the distances, positive.
     outlier: the epsilon of Eq. 4; 0 gives plain soft minima.
     mask: True where both points are real; elsewhere the answer is 0.
+
+    Raises
+    ------
+    ValueError: a mask that is not boolean.
     """
-    logits = -distances / temperature.to(distances.dtype)[..., None, None]
+    alpha = torch.as_tensor(temperature, dtype=distances.dtype, device=distances.device)
+    logits = -distances / alpha[..., None, None]
     if mask is not None:
+        _check_mask(mask)
         logits = torch.where(mask, logits, MASKED_LOGIT)
     rows = log_normaliser(logits, -1, outlier)
     columns = log_normaliser(logits, -2, outlier)
     buddies = torch.exp(2 * logits - rows - columns)
     return buddies if mask is None else torch.where(mask, buddies, 0.0)
+
+
+def _check_mask(mask: Tensor) -> None:
+    if mask.dtype != torch.bool:
+        raise ValueError(
+            f"mask has dtype {mask.dtype}; it is boolean, one per pair, and comes after the distances: "
+            "try hard_buddies(torch.cdist(P, Q))"
+        )
 
 
 def log_normaliser(logits: Tensor, dim: int, outlier: float) -> Tensor:

@@ -49,7 +49,8 @@ def check_same_kind(named: dict[str, Tensor | None]) -> None:
         if values.device != P.device:
             raise ValueError(f"{name} is on {values.device} and P on {P.device}: move one, {name}.to(P.device)")
         if values.dtype not in (P.dtype, torch.bool):
-            raise ValueError(f"{name} has dtype {values.dtype} and P {P.dtype}: convert one, {name}.to(P.dtype)")
+            one, other = (name, "P") if P.is_floating_point() else ("P", name)
+            raise ValueError(f"{name} has dtype {values.dtype} and P {P.dtype}: convert one, {one}.to({other}.dtype)")
 
 
 def check_pair(P: Tensor, Q: Tensor) -> None:

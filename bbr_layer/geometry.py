@@ -15,11 +15,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bbr_layer.arrays import numpy_too
 from bbr_layer.rotations import apply_rotation, rotation_from_rotvec, rotvec_from_rotation
 
 
 class RigidMotion(NamedTuple):
-    """A rotation and a translation, ``x_target = R x_source + t``.
+    """A rotation and a translation, ``x_target = R x_source + t``, as tensors or numpy arrays.
 
     Parameters
     ----------
@@ -30,11 +31,13 @@ class RigidMotion(NamedTuple):
     rotation: Tensor
     translation: Tensor
 
+    @numpy_too
     def __call__(self, points: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
         """Carry points ``(*batch, n, d)`` by the motion; the answer has the points' dtype."""
         moved = points.to(self.translation.dtype) @ self.rotation.mT + self.translation[..., None, :]
         return moved.to(points.dtype)
 
+    @numpy_too
     def rotate(self, vectors: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
         """Turn vectors (normals, directions) ``(*batch, n, d)`` without translating them."""
         return (vectors.to(self.rotation.dtype) @ self.rotation.mT).to(vectors.dtype)
@@ -45,6 +48,7 @@ class RigidMotion(NamedTuple):
         return self.translation.shape[-1]
 
     @property
+    @numpy_too
     def matrix(self) -> Tensor:
         """Homogeneous matrix ``(*batch, d + 1, d + 1)``."""
         top = torch.cat((self.rotation, self.translation[..., None]), dim=-1)
@@ -53,15 +57,18 @@ class RigidMotion(NamedTuple):
         return torch.cat((top, bottom), dim=-2)
 
     @property
+    @numpy_too
     def rotvec(self) -> Tensor:
         """Rotation vector ``(*batch, 3)`` (or the angle ``(*batch, 1)`` in 2D), radians."""
         return rotvec_from_rotation(self.rotation)
 
+    @numpy_too
     def inverse(self) -> "RigidMotion":
         """The motion that undoes this one."""
         rotation = self.rotation.mT
         return RigidMotion(rotation, -apply_rotation(rotation, self.translation))
 
+    @numpy_too
     def compose(self, inner: "RigidMotion") -> "RigidMotion":
         """This motion after ``inner``: ``a_from_c = a_from_b.compose(b_from_c)``."""
         carried = apply_rotation(self.rotation, inner.translation) + self.translation

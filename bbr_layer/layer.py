@@ -69,6 +69,8 @@ class BBRLayer(nn.Module):
         self.stages = nn.ModuleList(chosen)
         if not isinstance(starts, int) or starts < 1:
             raise ValueError(f"starts is {starts}; it must be a whole number of at least 1: try 7")
+        if backward is not None and not isinstance(backward, Backward):
+            raise ValueError(f"backward is {backward!r}; it must be one of the modes, as an object: try Replay()")
         self.starts = starts
         self.backward_mode = Replay() if backward is None else backward
         self.scaled = all(stage.chart.scaled for stage in chosen)

@@ -22,7 +22,7 @@ DIFFERENTIABLE = 4
 
 def is_transformed(given: CloudPair, start: RigidMotion | None) -> bool:
     """Whether any tensor is wrapped by ``torch.func``."""
-    tensors = (*given, *(start or ()))
+    tensors = (*given, *(start if isinstance(start, RigidMotion) else ()))  # the door has a sentence for anything else
     return any(isinstance(x, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(x) for x in tensors)
 
 

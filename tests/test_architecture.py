@@ -12,7 +12,7 @@ PROJECT = Path(__file__).resolve().parent.parent
 # "__init__" is the package's public face. A new file needs its name in a row.
 ORDER = {
     "bbr_layer": """
-        checks
+        checks arrays
         rotations
         geometry
         embedding pair trees

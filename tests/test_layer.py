@@ -156,6 +156,28 @@ def test_register_answers_numpy_with_numpy():
     result = register(P, P + 0.01)
     assert isinstance(result.target_from_source.rotation, np.ndarray)
     np.testing.assert_allclose(result.target_from_source.translation, -0.01, atol=2e-4)
+    assert all(isinstance(x, np.ndarray) for x in result[1:])
+    assert result.words == "converged" and result.weak_directions == []
+
+
+def test_a_motion_of_arrays_does_all_that_one_of_tensors_does():
+    P, tensors = _surface(), motion(3, 0.4, 0.3)
+    arrays = RigidMotion(*(x.numpy() for x in tensors))
+    pairs = [
+        (arrays(P.numpy()), tensors(P)),
+        (arrays.rotate(P.numpy()), tensors.rotate(P)),
+        (arrays.matrix, tensors.matrix),
+        (arrays.rotvec, tensors.rotvec),
+        (arrays.inverse().matrix, tensors.inverse().matrix),
+        ((arrays @ arrays.inverse()).matrix, torch.eye(4, dtype=torch.float64)),
+        (arrays.compose(inner=arrays).matrix, tensors.compose(tensors).matrix),
+    ]
+    for found, expected in pairs:
+        assert isinstance(found, np.ndarray)
+        np.testing.assert_allclose(found, expected.numpy(), atol=1e-12)
+    many = RigidMotion(*(np.stack([x, x]) for x in arrays))
+    np.testing.assert_allclose(many.between(0, 1).matrix, np.eye(4), atol=1e-12)
+    assert arrays.dimension == 3
 
 
 @pytest.mark.parametrize("name", [*NAMES, None])
@@ -211,6 +233,7 @@ WRONG = {
     "Q has one point": {"Q": Q3[:1]},
     "Q holds 3 values that are NaN or infinite": {"Q": torch.cat((Q3, torch.full((1, 3), torch.nan)))},
     "Q has dtype torch.float64 and P torch.float32": {"Q": Q3.double()},
+    "Q has dtype torch.float32 and P torch.int64: convert one, P.to(Q.dtype)": {"P": P3.long()},
     "Q is on meta and P on cpu": {"Q": Q3.to("meta")},
     "P is 3D and Q 2D": {"Q": Q3[:, :2]},
     "P has batch shape () and Q (1,)": {"Q": Q3[None]},
@@ -224,6 +247,8 @@ WRONG = {
     "P has batch shape (0,); that is no pair at all": {"P": P3.expand(0, 8, 3), "Q": Q3.expand(0, 9, 3)},
     "start.rotation is no rotation (R R^T is off the identity by 3": {"start": RigidMotion(2 * EYE, torch.zeros(3))},
     "start.rotation is no rotation": {"start": RigidMotion(-EYE, torch.zeros(3))},
+    "start is a Tensor; expected a RigidMotion: try RigidMotion.from_matrix": {"start": torch.eye(4)},
+    "start is a ndarray; expected a RigidMotion": {"start": np.eye(4)},
     "start moves 2D points and the clouds are 3D": {"start": RigidMotion.identity(2)},
 }
 
@@ -236,7 +261,7 @@ def test_wrong_calls_get_one_clear_sentence(sentence, as_a_user):
     assert "\n" not in str(caught.value)
 
 
-def test_wrong_settings_are_refused_where_they_are_given():
+def test_wrong_settings_are_refused_where_they_are_given(as_a_user):
     with pytest.raises(ValueError, match="there is no loss 'softBBQ'"):
         BBRLayer("softBBQ")
     with pytest.raises(ValueError, match="inner and temperature belong to one stage"):
@@ -245,6 +270,36 @@ def test_wrong_settings_are_refused_where_they_are_given():
         Truncated(0)
     with pytest.raises(ValueError, match="start is -2"):
         Annealed(-2.0)
+    with pytest.raises(ValueError, match=r"loss is 'F'; it must be one of the four losses: try SoftBBS\(\)"):
+        Stage("F")
+    with pytest.raises(ValueError, match=r"temperature is 0.5; it must be Annealed"):
+        Stage(SoftBD(), temperature=0.5)
+    with pytest.raises(ValueError, match=r"backward is 'replay'; it must be one of the modes, as an object: try"):
+        BBRLayer(backward="replay")
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_register_begins_at_a_matrix_too(d):
+    given, start = noisy_pair(d), motion(d, 0.2, 0.1)
+    P, Q = given["P"][0], given["Q"][0]
+    slow = BBRLayer("softBD", inner=Adam(1, 1e-12))
+    for begin in (start, start.matrix, start.matrix.numpy()):
+        found = register(P.numpy(), Q.numpy(), layer=slow, start=begin).target_from_source
+        np.testing.assert_allclose(found.matrix, start.matrix.numpy(), atol=1e-9)
+    begun_at_arrays = register(P.numpy(), Q.numpy(), layer=slow, start=RigidMotion(*(x.numpy() for x in start)))
+    np.testing.assert_allclose(begun_at_arrays.target_from_source.matrix, start.matrix.numpy(), atol=1e-9)
+    found = register(P, Q, layer=slow, start=start.matrix).target_from_source
+    torch.testing.assert_close(found.matrix, start.matrix)
+
+
+def test_register_says_what_it_has_no_argument_for(as_a_user):
+    P = P3.numpy()
+    with pytest.raises(TypeError, match=r"^register has no argument starts; there are layer, P_features,.*BBRLayer"):
+        register(P, P, starts=7)
+    with pytest.raises(ValueError, match=r"^start has shape \(3,\); give a RigidMotion, or a 4 x 4 matrix"):
+        register(P, P, start=np.zeros(3))
+    with pytest.raises(ValueError, match="^start moves 2D points and the clouds are 3D"):
+        register(P, P, start=np.eye(3))
 
 
 def test_detached_layer_still_moves_its_argument_differentiably():

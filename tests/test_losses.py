@@ -51,6 +51,14 @@ def test_soft_buddies_become_hard_ones_when_cold():
     torch.testing.assert_close(cold.round(), hard_buddies(D).double())
 
 
+def test_buddies_take_a_number_for_the_temperature_and_a_boolean_mask(as_a_user):
+    D = torch.rand(4, 5, dtype=torch.float64)
+    torch.testing.assert_close(soft_buddies(D, 0.3), soft_buddies(D, torch.tensor(0.3)))
+    for wrong in (lambda: hard_buddies(D, D), lambda: soft_buddies(D, 0.3, mask=D)):
+        with pytest.raises(ValueError, match=r"^mask has dtype torch.float64; it is boolean.*try hard_buddies"):
+            wrong()
+
+
 def test_far_points_have_no_buddies_and_no_gradient_trouble():
     D = torch.full((3, 4), 1e4, dtype=torch.float64, requires_grad=True)
     B = soft_buddies(D, torch.tensor(1e-2, dtype=torch.float64))
