@@ -7,20 +7,20 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 import torch
 
-Fields = TypeVar("Fields", bound=tuple[Any, ...])
+First = TypeVar("First")
 Rest = ParamSpec("Rest")
 Answer = TypeVar("Answer")
 
 
-def numpy_too(method: Callable[Concatenate[Fields, Rest], Answer]) -> Callable[Concatenate[Fields, Rest], Answer]:
-    """A method of a named tuple of tensors that answers in numpy where the fields are numpy arrays."""
+def numpy_too(function: Callable[Concatenate[First, Rest], Answer]) -> Callable[Concatenate[First, Rest], Answer]:
+    """A function of tensors that answers in numpy where its first argument is an array, or a named tuple of arrays."""
 
-    @wraps(method)
-    def either(self: Fields, /, *args: Rest.args, **kwargs: Rest.kwargs) -> Answer:
-        if not isinstance(self[0], np.ndarray):
-            return method(self, *args, **kwargs)
+    @wraps(function)
+    def either(first: First, /, *args: Rest.args, **kwargs: Rest.kwargs) -> Answer:
+        if not isinstance(first[0] if isinstance(first, tuple) else first, np.ndarray):
+            return function(first, *args, **kwargs)
         given = {name: tensors(x) for name, x in kwargs.items()}
-        return arrays(method(tensors(self), *map(tensors, args), **given))
+        return arrays(function(tensors(first), *map(tensors, args), **given))
 
     return either
 
@@ -29,7 +29,12 @@ def tensors(value: Any) -> Any:
     """Arrays, alone or in a named tuple, as tensors; anything else as it is."""
     if isinstance(value, tuple):
         return type(value)(*map(tensors, value))
-    return torch.as_tensor(value) if isinstance(value, np.ndarray) else value
+    return from_array(value) if isinstance(value, np.ndarray) else value
+
+
+def from_array(array: np.ndarray) -> torch.Tensor:
+    """A tensor of its own memory: arrays may be read-only, or run backwards."""
+    return torch.tensor(np.ascontiguousarray(array))
 
 
 def arrays(value: Any) -> Any:

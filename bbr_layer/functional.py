@@ -1,25 +1,30 @@
 """The functional twin of the layer, for tensors and numpy arrays alike."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
-from bbr_layer.arrays import arrays, tensors
+from bbr_layer.arrays import arrays, from_array, tensors
+from bbr_layer.clouds import Cloud
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.layer import BBRLayer
 from bbr_layer.pair import CloudPair
 from bbr_layer.registration import Registration
 
 Array = torch.Tensor | np.ndarray
+Points = Array | Cloud
 # What can be said of a pair beside the two clouds.
 GIVEN = {*CloudPair._fields, "start"} - {"P", "Q", "spacing"}
 
 
-def register(P: Array, Q: Array, *, layer: BBRLayer | None = None, **given: Array | RigidMotion) -> Registration:
-    """Find the motion that carries Q onto P; numpy arrays are answered in numpy.
+def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Array | RigidMotion) -> Registration:
+    """Find the motion that carries Q onto P; numpy arrays are answered in numpy, and may be of any type of number.
 
     Parameters
     ----------
-    P, Q: ``(*batch, n, d)`` target and ``(*batch, m, d)`` source.
+    P, Q: ``(*batch, n, d)`` target and ``(*batch, m, d)`` source; or each a ``Cloud`` as ``read_cloud`` gives it, whose
+        normals are used where both have some.
     layer: default ``BBRLayer()``; settings are the layer's, ``layer=BBRLayer.robust()``.
     given: normals, features, weights, masks and start, as ``BBRLayer.forward`` names them; the start may be a matrix
         ``(*batch, d + 1, d + 1)``.
@@ -35,6 +40,9 @@ def register(P: Array, Q: Array, *, layer: BBRLayer | None = None, **given: Arra
            [0., 1., 0.],
            [0., 0., 1.]])
     """
+    if isinstance(P, Cloud) and isinstance(Q, Cloud) and P.normals is not None and Q.normals is not None:
+        given = {"P_normals": P.normals, "Q_normals": Q.normals} | given
+    P, Q = (x.points if isinstance(x, Cloud) else x for x in (P, Q))
     unknown = sorted(given.keys() - GIVEN)
     if unknown:
         known = ", ".join(sorted(GIVEN))
@@ -48,20 +56,31 @@ def register(P: Array, Q: Array, *, layer: BBRLayer | None = None, **given: Arra
         given["start"] = tensors(start) if isinstance(start, RigidMotion) else RigidMotion.from_matrix(_matrix(start))
     if isinstance(P, torch.Tensor):
         return chosen(P, Q, **given)
-    others = {name: _as_tensor(name, x) if isinstance(x, np.ndarray) else x for name, x in given.items()}
-    result = chosen(_as_tensor("P", P), _as_tensor("Q", Q), **others)
-    answer: Registration = arrays(result)
+    answer: Registration = arrays(chosen(**_of_one_type({"P": P, "Q": Q, **given})))
     return answer
 
 
 def _matrix(start: Array) -> torch.Tensor:
-    matrix = _as_tensor("start", start)
+    matrix = start if isinstance(start, torch.Tensor) else from_array(_numbers("start", start))
     if matrix.ndim < 2 or matrix.shape[-1] not in (3, 4) or matrix.shape[-1] != matrix.shape[-2]:
         raise ValueError(f"start has shape {tuple(matrix.shape)}; give a RigidMotion, or a 4 x 4 matrix (in 2D 3 x 3)")
     return matrix.double()
 
 
-def _as_tensor(name: str, array: Array) -> torch.Tensor:
-    if isinstance(array, np.ndarray) and array.dtype.kind not in "biufc":
+def _of_one_type(given: Mapping[str, Array | RigidMotion]) -> dict[str, torch.Tensor | RigidMotion]:
+    """Arrays as tensors, all numbers of the type that holds each of them, float32 at least; the rest as it is."""
+    found, others = {}, {}
+    for name, x in given.items():
+        if isinstance(x, torch.Tensor | RigidMotion):
+            others[name] = x
+        else:
+            found[name] = _numbers(name, x)
+    wanted = np.result_type(np.float32, *(x.dtype for x in found.values()))
+    return others | {name: from_array(x if x.dtype == bool else x.astype(wanted)) for name, x in found.items()}
+
+
+def _numbers(name: str, given: Array) -> np.ndarray:
+    array = np.asarray(given)
+    if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} is an array of {array.dtype}; it must hold numbers: try {name}.astype(float)")
-    return torch.as_tensor(array)
+    return array

@@ -107,11 +107,13 @@ class RigidMotion(NamedTuple):
         return RigidMotion(matrix[..., :-1, :-1], matrix[..., :-1, -1])
 
     @staticmethod
+    @numpy_too
     def from_rotvec(rotvec: Float[Tensor, "*batch k"], translation: Float[Tensor, "*batch d"]) -> "RigidMotion":
         """From a rotation vector ``(*batch, 3)`` or an angle ``(*batch, 1)``, radians, and a translation."""
         return RigidMotion(rotation_from_rotvec(rotvec), translation)
 
 
+@numpy_too
 def angular_error(first: Float[Tensor, "... d d"], second: Float[Tensor, "... d d"]) -> Float[Tensor, "..."]:
     """Angle between two rotations, ``(*batch,)`` radians: ``2 asin(||R1 - R2||_F / sqrt 8)``.
 
@@ -123,6 +125,7 @@ def angular_error(first: Float[Tensor, "... d d"], second: Float[Tensor, "... d 
     return 2 * torch.asin((chord / scale).clamp(max=1.0))
 
 
+@numpy_too
 def translation_error(first: Float[Tensor, "... d"], second: Float[Tensor, "... d"]) -> Float[Tensor, "..."]:
     """Distance between two translations, ``(*batch,)``, in the data's unit."""
     return torch.linalg.vector_norm(first - second, dim=-1)

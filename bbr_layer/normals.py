@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bbr_layer.arrays import numpy_too
 from bbr_layer.neighbourhoods import nearest_neighbours
 
 COMPILED = importlib.util.find_spec("numba") is not None
@@ -17,6 +18,7 @@ NORMAL_NEIGHBOURS = 8
 EIGENVALUE_GAP = 1e-6
 
 
+@numpy_too
 def estimate_normals(
     points: Float[Tensor, "*batch n d"],
     neighbours: int = NORMAL_NEIGHBOURS,

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bbr_layer.arrays import numpy_too
 from bbr_layer.distances import smooth_root
 from bbr_layer.neighbourhoods import known_tree, listed, neighbours_of
 from bbr_layer.pair import CloudPair
@@ -22,6 +23,7 @@ def with_spacing(pair: CloudPair) -> CloudPair:
     return pair._replace(spacing=torch.where(spacing > 0, spacing, 1.0))
 
 
+@numpy_too
 def point_spacing(
     points: Float[Tensor, "*batch n d"], mask: Bool[Tensor, "*batch n"] | None = None
 ) -> Float[Tensor, "*batch"]:

@@ -12,6 +12,7 @@ from bbr_layer import (
     Adam,
     Annealed,
     BBRLayer,
+    Cloud,
     Detached,
     RigidMotion,
     SoftBD,
@@ -19,7 +20,10 @@ from bbr_layer import (
     Status,
     Truncated,
     angular_error,
+    estimate_normals,
+    point_spacing,
     register,
+    translation_error,
 )
 
 NAMES = ["softBBS", "softBD", "N", "F"]
@@ -158,6 +162,54 @@ def test_register_answers_numpy_with_numpy():
     np.testing.assert_allclose(result.target_from_source.translation, -0.01, atol=2e-4)
     assert all(isinstance(x, np.ndarray) for x in result[1:])
     assert result.words == "converged" and result.weak_directions == []
+
+
+def test_register_takes_arrays_as_they_come(as_a_user):
+    P, truth = _surface(), motion(3, 0.3, 0.1)
+    Q = truth.inverse()(P)
+    P, Q = P.numpy(), Q.numpy()
+    plain = register(P, Q).target_from_source.matrix
+    read_only = np.frombuffer(P.tobytes()).reshape(-1, 3)
+    for other in ((read_only, Q), (np.asfortranarray(P), Q), (P[::-1][::-1], Q), (P.tolist(), Q)):
+        np.testing.assert_array_equal(register(*other).target_from_source.matrix, plain)
+    single = register(P.astype(np.float32), Q.astype(np.float32))
+    assert single.loss.dtype == np.float64 and 0 < np.abs(single.target_from_source.matrix - plain).max() < 1e-4
+    mixed = register(P.astype(np.float32), Q)
+    np.testing.assert_array_equal(
+        mixed.target_from_source.matrix, register(P.astype(np.float32).astype(float), Q).target_from_source.matrix
+    )
+    grid = (1000 * P).astype(int)
+    np.testing.assert_allclose(register(grid, grid).target_from_source.matrix, np.eye(4), atol=1e-3)
+
+
+def test_register_takes_clouds_and_the_normals_that_both_have():
+    P = _surface()
+    Q, normals = motion(3, 0.3, 0.1).inverse()(P).numpy(), estimate_normals(P, 20).numpy()
+    P, turned = P.numpy(), motion(3, 0.3, 0.1).inverse().rotate(estimate_normals(P, 20)).numpy()
+    with_normals = register(P, Q, P_normals=normals, Q_normals=turned).target_from_source.matrix
+    without = register(P, Q).target_from_source.matrix
+    assert not np.array_equal(with_normals, without)
+    both = register(Cloud(P, normals), Cloud(Q, turned)).target_from_source.matrix
+    np.testing.assert_array_equal(both, with_normals)
+    np.testing.assert_array_equal(register(Cloud(P, normals), Cloud(Q)).target_from_source.matrix, without)
+    own = register(Cloud(P, normals), Cloud(Q, turned), P_normals=-normals).target_from_source.matrix
+    np.testing.assert_array_equal(own, register(P, Q, P_normals=-normals, Q_normals=turned).target_from_source.matrix)
+
+
+def test_measures_of_arrays_are_arrays():
+    P, one, other = _surface(), motion(3, 0.3, 0.1), motion(3, 0.5, 0.2)
+    for function, given in (
+        (estimate_normals, (P, 12)),
+        (point_spacing, (P,)),
+        (angular_error, (one.rotation, other.rotation)),
+        (translation_error, (one.translation, other.translation)),
+        (RigidMotion.from_rotvec, (one.rotvec, one.translation)),
+    ):
+        found = function(*(x.numpy() if isinstance(x, torch.Tensor) else x for x in given))
+        expected = function(*given)
+        for x, y in zip(*((z if isinstance(z, tuple) else (z,)) for z in (found, expected)), strict=True):
+            assert isinstance(x, np.ndarray)
+            np.testing.assert_allclose(x, y.numpy(), atol=1e-12)
 
 
 def test_a_motion_of_arrays_does_all_that_one_of_tensors_does():
