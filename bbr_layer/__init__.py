@@ -8,6 +8,7 @@ from bbr_layer.backward import Replay as Replay
 from bbr_layer.backward import Truncated as Truncated
 from bbr_layer.buddies import hard_buddies as hard_buddies
 from bbr_layer.buddies import soft_buddies as soft_buddies
+from bbr_layer.buddies_loss import BestBuddiesLoss as BestBuddiesLoss
 from bbr_layer.cloud_writing import write_cloud as write_cloud
 from bbr_layer.clouds import Cloud as Cloud
 from bbr_layer.clouds import read_cloud as read_cloud

@@ -56,14 +56,25 @@ def named_stage(
     ------
     ValueError: another name.
     """
+    loss = named_loss(name)
+    _, steps, rate, start, end = _NAMED[name]
+    inner = Adam(steps, rate) if inner is None else inner
+    temperature = Annealed(start, end) if temperature is None else temperature
+    return Stage(loss, inner, temperature, points=points, above=above)
+
+
+def named_loss(name: str) -> Loss:
+    """The loss of the paper's name, rounded off as in the layer.
+
+    Raises
+    ------
+    ValueError: another name.
+    """
     if name not in _NAMED:
         raise ValueError(
             f"there is no loss {name!r}; choose one of {', '.join(_NAMED)}, or BBRLayer.fast() or .robust()"
         )
-    loss, steps, rate, start, end = _NAMED[name]
-    inner = Adam(steps, rate) if inner is None else inner
-    temperature = Annealed(start, end) if temperature is None else temperature
-    return Stage(loss(), inner, temperature, points=points, above=above)
+    return _NAMED[name][0]()
 
 
 # Loss, steps, rate, and temperature from and to in point spacings. softBBS and F: measured on the bunny, horse and

@@ -50,6 +50,7 @@ ORDER = {
         backward transforms preparation
         stage
         named_stages descent
+        buddies_loss
         starts
         layer
         atomic cloud_columns
