@@ -23,8 +23,8 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
 
     Parameters
     ----------
-    P, Q: ``(*batch, n, d)`` target and ``(*batch, m, d)`` source; or each a ``Cloud`` as ``read_cloud`` gives it, whose
-        normals are used where both have some.
+    P, Q: ``(*batch, n, d)`` target and ``(*batch, m, d)`` source; or each a ``Cloud`` as ``read_cloud`` gives it, with
+        the normals it has.
     layer: default ``BBRLayer()``; settings are the layer's, ``layer=BBRLayer.robust()``.
     given: normals, features, weights, masks and start, as ``BBRLayer.forward`` names them; the start may be a matrix
         ``(*batch, d + 1, d + 1)``.
@@ -40,8 +40,9 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
            [0., 1., 0.],
            [0., 0., 1.]])
     """
-    if isinstance(P, Cloud) and isinstance(Q, Cloud) and P.normals is not None and Q.normals is not None:
-        given = {"P_normals": P.normals, "Q_normals": Q.normals} | given
+    for side, cloud in (("P", P), ("Q", Q)):
+        if isinstance(cloud, Cloud) and cloud.normals is not None:
+            given.setdefault(f"{side}_normals", cloud.normals)
     P, Q = (x.points if isinstance(x, Cloud) else x for x in (P, Q))
     unknown = sorted(given.keys() - GIVEN)
     if unknown:

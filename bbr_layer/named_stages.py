@@ -14,8 +14,8 @@ from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
 # Points of each cloud that soft buddies are sought among, whose cost grows with the square: on streets 1000 lead to
 # where F goes on (benchmarks/lidar.md). The fast ones trade basin for time: benchmarks/solvers.md.
 SOFT_POINTS, FAST_SOFT_POINTS = 1000, 300
-# Points of each cloud that F begins on: its basin is as wide as the points are sparse. Without this stage two objects
-# that moved apart (docs/experiments.md, Fig. 5, 900 points) fail twice as often.
+# Points of each cloud that F begins on: its basin is as wide as the points are sparse. Chosen on the distractor of
+# docs/experiments.md, Fig. 5.
 FIRST_POINTS = 1000
 # Points of each cloud that most of F's steps see; the last few see all. Chosen: a twelfth of a full lidar scan.
 FINE_POINTS = 10_000

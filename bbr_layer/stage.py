@@ -17,7 +17,7 @@ from bbr_layer.inner.unroll import Problem, cut_from_graph, value
 from bbr_layer.loss_base import Loss, Objective, SoftLoss
 from bbr_layer.pair import CloudPair, Frame, centre_and_radius
 from bbr_layer.registration import StageResult
-from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
+from bbr_layer.temperature import Annealed, Temperature, Unrounded
 from bbr_layer.thinning import thinned_pair
 
 # Rounding of soft distances at zero, in point spacings: the measured value at which the unrolled gradient of an exact
@@ -125,7 +125,7 @@ def _check(loss: Loss, inner: object, temperature: object, points: object, above
     """Refuse settings of a stage that cannot work."""
     if not isinstance(loss, Loss):
         raise ValueError(f"loss is {loss!r}; it must be one of the four losses: try SoftBBS(), or BBRLayer('softBBS')")
-    if temperature is not None and not isinstance(temperature, Annealed | Learned | Unrounded):
+    if temperature is not None and not isinstance(temperature, Temperature):
         raise ValueError(f"temperature is {temperature!r}; it must be Annealed(...) or Learned(...): try Annealed()")
     if points is not None and not (isinstance(points, int) and points >= FEWEST_POINTS):
         raise ValueError(f"points is {points}; a stage needs at least {FEWEST_POINTS} of each cloud: try 1000")

@@ -13,7 +13,6 @@ from bbr_layer import RigidMotion
 from train.config import EdgeConfig
 from train.edges import register_edges
 from train.given_motion import FAR, GIVEN, RIGHT_TO, clear, with_given, without_given
-from train.pose_graph import Edges
 from train.scans import ScanSet
 from train.simulate import WorldSettings
 
@@ -97,14 +96,11 @@ def test_an_edge_far_from_the_given_motion_stays_only_where_it_scores_well(score
     scores[lost] = score
     slips = 0.02 * deviations  # radians; the odometry's own slips have this deviation
     start = RigidMotion.from_matrix(torch.from_numpy(scans.start))
-    given = start.item(torch.tensor([lost])).inverse() @ start.item(torch.tensor([lost + 1]))
+    given = start.between(lost, lost + 1)
     turn = RigidMotion.from_rotvec(torch.tensor([[slips]]).double(), torch.zeros(1, 2).double())
-    chain.target_from_source.rotation[lost] = (turn.rotation @ given.rotation)[0]
-    chain.target_from_source.translation[lost] = given.translation[0]
-    found = without_given(*_believed(with_given(chain._replace(score=scores), scans, spacing=0.1)))[0]
+    chain.target_from_source.rotation[lost] = turn.rotation[0] @ given.rotation
+    chain.target_from_source.translation[lost] = given.translation
+    both = with_given(chain._replace(score=scores), scans, spacing=0.1)
+    found, _ = without_given(both, torch.ones(len(both.target)))
     assert (lost in found.target.tolist()) == kept
     assert len(found.target) == SCANS - 1 - (not kept), "the others stay"
-
-
-def _believed(edges: Edges) -> tuple[Edges, torch.Tensor]:
-    return edges, torch.ones(len(edges.target))

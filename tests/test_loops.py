@@ -39,7 +39,7 @@ def _tried(turns: list[float], monkeypatch: pytest.MonkeyPatch) -> list[tuple[in
 
     monkeypatch.setattr(module, "register_pairs", registered)
     steps = torch.arange(len(turns) - 1)
-    chain = _chain(poses.item(steps).inverse() @ poses.item(steps + 1), (steps, steps + 1))
+    chain = _chain(poses.between(steps, steps + 1), (steps, steps + 1))
     loops(scene, poses, chain, CONFIG, silent, weights=None)
     return tried
 

@@ -42,7 +42,8 @@ def with_given(edges: Edges, scans: ScanSet, spacing: float) -> Edges:
     world = RigidMotion.from_matrix(torch.from_numpy(scans.start))
     motion = world.between(edges.target, edges.source)
     good = edges.score >= edges.score.median()
-    scatter = GAUSSIAN * disagreement(motion, edges)[good].abs().median(0).values
+    away = disagreement(motion, edges).abs()
+    scatter = GAUSSIAN * away[good].median(0).values
     registered = edges.information[good].diagonal(dim1=-2, dim2=-1).median(0).values
     strength = torch.minimum((RIGHT_TO * spacing / scatter.clamp(min=1e-300)).square(), registered)
     given = edges._replace(
@@ -51,7 +52,7 @@ def with_given(edges: Edges, scans: ScanSet, spacing: float) -> Edges:
         score=torch.zeros_like(edges.score),
         kind=torch.full_like(edges.kind, GIVEN),
     )
-    far = (disagreement(motion, edges).abs() > FAR * scatter).any(-1) & ~good
+    far = (away > FAR * scatter).any(-1) & ~good
     return clear(edges.kept(~far), edges).joined(given)
 
 
