@@ -12,6 +12,7 @@ from bbr_layer.losses import BuddyFilter
 from bbr_layer.named_stages import named_loss
 from bbr_layer.pair import CloudPair
 from bbr_layer.preparation import prepared
+from bbr_layer.transforms import is_transformed
 
 # Temperatures in point spacings: where the layer ends (soft buddies), and between where its F begins and ends.
 SOFT, HARD = 1.0, 0.1
@@ -76,6 +77,7 @@ class BestBuddiesLoss(nn.Module):
         Raises
         ------
         ValueError: one sentence on what is wrong with which argument.
+        RuntimeError: called under ``torch.func``.
         """
         given = CloudPair(P, Q, P_normals, Q_normals, P_features, Q_features, P_weights, Q_weights, P_mask, Q_mask)
         if torch.compiler.is_compiling():
@@ -83,6 +85,10 @@ class BestBuddiesLoss(nn.Module):
         return self._of(given)
 
     def _of(self, given: CloudPair) -> Tensor:
+        if is_transformed(given, None):
+            raise RuntimeError(
+                "BestBuddiesLoss does not go through torch.func: use torch.autograd.grad, and a batch dimension for vmap"
+            )
         flat = checked_pair(given)
         with torch.autocast(flat.P.device.type, enabled=False):
             frame, pair = prepared(flat, self.loss.needs_normals, False)

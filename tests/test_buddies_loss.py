@@ -127,8 +127,13 @@ def test_modes_of_torch_and_types():
     loss = BestBuddiesLoss("F")
     plain = loss(P, Q)
     assert plain.dtype == torch.float32 and loss(P.double(), Q.double()).dtype == torch.float64
-    with torch.no_grad():
-        assert torch.equal(loss(P, Q), plain)
+    for off in (torch.no_grad, torch.inference_mode):
+        with off():
+            assert torch.equal(loss(P, Q), plain)
+    assert torch.equal(torch.compile(lambda x: loss(x, Q), backend="eager")(P), plain)
+    for transformed, points in ((torch.func.grad, P), (torch.func.vmap, P.expand(2, -1, -1))):
+        with pytest.raises(RuntimeError, match="does not go through torch.func: use torch.autograd.grad"):
+            transformed(lambda x: loss(x, Q))(points)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(loss(P, Q), plain)
     assert repr(loss) == "BestBuddiesLoss(\n  temperature=0.1\n  (loss): BuddyFilter()\n)"
