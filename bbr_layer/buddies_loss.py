@@ -87,7 +87,7 @@ class BestBuddiesLoss(nn.Module):
     def _of(self, given: CloudPair) -> Tensor:
         if is_transformed(given, None):
             raise RuntimeError(
-                "BestBuddiesLoss does not go through torch.func: use torch.autograd.grad, and a batch dimension for vmap"
+                "BestBuddiesLoss does not go through torch.func: use torch.autograd.grad, and batches for vmap"
             )
         flat = checked_pair(given)
         with torch.autocast(flat.P.device.type, enabled=False):

@@ -122,7 +122,7 @@ def test_what_the_other_cloud_does_not_have_is_left_alone_and_the_rest_comes_nea
     assert torch.autograd.grad(chamfer, P)[0][len(Q) :].abs().amax(1).min() > 1e-4
 
 
-def test_modes_of_torch_and_types():
+def test_modes_of_torch_and_types(as_a_user):
     P, Q = bumpy(60, 3).float(), bumpy(50, 3).float()
     loss = BestBuddiesLoss("F")
     plain = loss(P, Q)
