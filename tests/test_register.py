@@ -45,6 +45,8 @@ def test_register_takes_arrays_as_they_come(as_a_user):
         np.testing.assert_array_equal(register(*other).target_from_source.matrix, plain)
     single = register(P.astype(np.float32), Q.astype(np.float32))
     assert single.loss.dtype == np.float64 and 0 < np.abs(single.target_from_source.matrix - plain).max() < 1e-4
+    as_tensors = BBRLayer()(torch.from_numpy(P).float(), torch.from_numpy(Q).float()).target_from_source.matrix
+    np.testing.assert_array_equal(single.target_from_source.matrix, as_tensors.numpy())
     mixed = register(P.astype(np.float32), Q)
     np.testing.assert_array_equal(
         mixed.target_from_source.matrix, register(P.astype(np.float32).astype(float), Q).target_from_source.matrix
