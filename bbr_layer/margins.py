@@ -2,11 +2,15 @@
 
 import importlib.util
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bbr_layer.trees import ROUNDING, Tree, in_space, squared_length
+
+if TYPE_CHECKING:
+    from bbr_layer.kernels.cpu_walk import Memory
 
 COMPILED = importlib.util.find_spec("numba") is not None
 
@@ -42,6 +46,7 @@ class Margins:
         self.index = np.zeros(len(moving), dtype=np.int64)
         self.reach = np.full(len(moving), -1.0)  # r; -1: never looked up
         self.places = np.zeros((len(moving), 3))  # y
+        self.distance = np.zeros(len(moving))  # of the nearest at the last asking
         self.everybody = np.ones(len(moving), dtype=bool)
         self.asked = self.searched = self.looked_up = 0
         self._tables: tuple | None = None
@@ -50,39 +55,66 @@ class Margins:
         """Index of the nearest point of the tree to each moved point, right for the ``wanted`` ones (None: all)."""
         asked = self.everybody if wanted is None else wanted
         searched, rows = self._changed(pose, asked)
-        self.asked += int(np.count_nonzero(asked))
-        self.searched += searched
-        self.looked_up += len(rows)
-        if len(rows):
-            at = _moved(pose, self.moving[rows])
-            self.index[rows], _, self.reach[rows] = self.tree.nearest(at[:, : self.tree.points.shape[1]])
-            self.places[rows] = at
+        self._look_up(rows)
+        self.count(int(np.count_nonzero(asked)), searched, len(rows))
         return self.index
+
+    def champions(self, pose: Pose, chosen: tuple[np.ndarray, np.ndarray]) -> Int[np.ndarray, "m"]:
+        """Index of the nearest point of the tree to each moved point that is chosen, or any nearer than all choosers.
+
+        Cheaper than ``nearest``, and as good for what is mutual; see ``kernels/cpu_mutual.py``.
+
+        Parameters
+        ----------
+        chosen: which of the ``m`` each point of the tree chooses, and how far off it is, ``(n,)`` each.
+        """
+        from bbr_layer.kernels import cpu_mutual, cpu_walk  # only where they are used: Numba takes long to load
+
+        held = cpu_mutual.champions(*chosen, len(self.moving))
+        lists = cpu_walk.Lists(*self.tree.lists())
+        asked, searched, rows = cpu_mutual.contest(lists, self.moving, pose, held, self._memory())
+        self._look_up(rows)
+        self.count(asked, searched, len(rows))
+        return self.index
+
+    def count(self, asked: int, searched: int, looked_up: int) -> None:
+        """Add to what was asked, searched for and looked up."""
+        self.asked += int(asked)
+        self.searched += int(searched)
+        self.looked_up += int(looked_up)
 
     def tables(self) -> tuple:
         """Everything that compiled code reads and writes: lists, moving points, all of them wanted, memory."""
         if self._tables is None:
             from bbr_layer.kernels import cpu_walk
 
-            lists, memory = self.tree.lists(), cpu_walk.Memory(self.index, self.reach, self.places)
-            self._tables = cpu_walk.Lists(*lists), self.moving, self.everybody, memory
+            self._tables = cpu_walk.Lists(*self.tree.lists()), self.moving, self.everybody, self._memory()
         return self._tables
 
-    def _changed(self, pose: Pose, wanted: np.ndarray) -> tuple[int, Int[np.ndarray, "k"]]:
-        """How many of the wanted neighbours may have changed, and the rows of those still to be looked up."""
-        if not self.kept:
-            rows = np.flatnonzero(wanted)
-            return len(rows), rows
-        if COMPILED and self.searched:
-            from bbr_layer.kernels import cpu_walk  # only where it is used: Numba takes long to load
+    def _memory(self) -> "Memory":
+        from bbr_layer.kernels import cpu_walk
 
-            memory = cpu_walk.Memory(self.index, self.reach, self.places)
-            lists = cpu_walk.Lists(*self.tree.lists())
-            return cpu_walk.refresh(lists, self.moving, pose, wanted, memory)
+        return cpu_walk.Memory(self.index, self.reach, self.places, self.distance)
+
+    def _look_up(self, rows: Int[np.ndarray, "k"]) -> None:
+        """Search the tree for the neighbours of moved points, at their places."""
+        if len(rows):
+            at = self.places[rows, : self.tree.points.shape[1]]
+            self.index[rows], self.distance[rows], self.reach[rows] = self.tree.nearest(at)
+
+    def _changed(self, pose: Pose, wanted: np.ndarray) -> tuple[int, Int[np.ndarray, "k"]]:
+        """How many of the wanted neighbours may have changed, and the rows of those, in their places, to look up."""
+        if self.kept and COMPILED and self.searched:
+            from bbr_layer.kernels import cpu_walk
+
+            return cpu_walk.refresh(cpu_walk.Lists(*self.tree.lists()), self.moving, pose, wanted, self._memory())
         at = _moved(pose, self.moving)
-        moved = np.sqrt(squared_length(at - self.places))
-        own = np.sqrt(squared_length(at - in_space(self.tree.points.take(self.index, axis=0))))
-        rows = np.flatnonzero(wanted & ~((own + moved) * (1 + ROUNDING) < self.reach))
+        if self.kept:
+            moved = np.sqrt(squared_length(at - self.places))
+            own = np.sqrt(squared_length(at - in_space(self.tree.points.take(self.index, axis=0))))
+            wanted = wanted & ~((own + moved) * (1 + ROUNDING) < self.reach)
+        rows = np.flatnonzero(wanted)
+        self.places[rows] = at[rows]
         return len(rows), rows
 
 
@@ -113,28 +145,23 @@ class MutualMargins:
             return self._compiled(pose)
         index = self.forth.nearest(pose)
         back = pose[0].T.copy(), -pose[0].T @ pose[1]
-        if COMPILED:
-            from bbr_layer.kernels import cpu_walk
-
-            nearest_Q = self.back.nearest(back, cpu_walk.marked(index, len(self.back.moving)))
-            return index, cpu_walk.agreeing(index, nearest_Q)
+        if COMPILED and self.forth.kept and self.back.searched:
+            return index, self.back.champions(back, (index, self.forth.distance))[index] == np.arange(len(index))
         chosen = np.zeros(len(self.back.moving), dtype=bool)
         chosen[index] = True
         return index, self.back.nearest(back, chosen)[index] == np.arange(len(index))
 
     def _compiled(self, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
-        from bbr_layer.kernels import cpu_walk
+        from bbr_layer.kernels import cpu_mutual
 
-        mutual, counts = cpu_walk.mutual_pairs(self.forth.tables(), self.back.tables(), pose)
+        mutual, counts = cpu_mutual.mutual_pairs(self.forth.tables(), self.back.tables(), pose)
         self.count(counts)
         return self.forth.index, mutual
 
     def count(self, counts: Sequence[Sequence[int]]) -> None:
         """Add to what each side was asked, searched for and looked up."""
-        for side, (asked, searched, looked_up) in zip((self.forth, self.back), counts, strict=True):
-            side.asked += int(asked)
-            side.searched += int(searched)
-            side.looked_up += int(looked_up)
+        for side, of_side in zip((self.forth, self.back), counts, strict=True):
+            side.count(*of_side)
 
 
 def _moved(pose: Pose, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:

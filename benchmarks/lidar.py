@@ -148,7 +148,7 @@ def whole_rows(repeats: int) -> list[str]:
     rows = []
     for name, run in runs.items():
         found, seconds = RigidMotion.from_matrix(run()), best(run, repeats)
-        angle = np.rad2deg(angular_error(found.rotation, truth.rotation))
+        angle = angular_error(found.rotation, truth.rotation).rad2deg().item()
         length = (found.translation - truth.translation).norm()
         rows.append(f"| {name} | {seconds:.2f} | {angle:.3f} | {length:.3f} |")
     return ["| from points to pose | s | error, deg | error, m |", "|---|---|---|---|", *rows]

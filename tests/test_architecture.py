@@ -19,7 +19,7 @@ ORDER = {
         kernels
         kernels.cpu_math kernels.cpu_threads
         kernels.cpu_walk kernels.cpu_turns kernels.cpu_axes
-        kernels.cpu_adam
+        kernels.cpu_adam kernels.cpu_mutual
         margins
         cloud_trees
         neighbours neighbourhoods distances

@@ -5,7 +5,7 @@ import numpy as np
 from bbr_layer.kernels.cpu_adam import advance, retreat
 from bbr_layer.kernels.cpu_matched import add_adjoint, add_weights, slope_of
 from bbr_layer.kernels.cpu_math import exact
-from bbr_layer.kernels.cpu_walk import mutual_pairs
+from bbr_layer.kernels.cpu_mutual import mutual_pairs
 
 
 @exact
