@@ -3,8 +3,9 @@
 from collections.abc import Callable
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
+from bbr_layer.alike import moved_little
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.charts import Chart, RotationVector
@@ -15,7 +16,7 @@ from bbr_layer.inner.run import run
 from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.inner.unroll import Problem, cut_from_graph, value
 from bbr_layer.loss_base import Loss, Objective, SoftLoss
-from bbr_layer.pair import CloudPair, Frame, centre_and_radius
+from bbr_layer.pair import CloudPair, Frame
 from bbr_layer.registration import StageResult
 from bbr_layer.temperature import Annealed, Temperature, Unrounded
 from bbr_layer.thinning import thinned_pair
@@ -23,8 +24,6 @@ from bbr_layer.thinning import thinned_pair
 # Rounding of soft distances at zero, in point spacings: the measured value at which the unrolled gradient of an exact
 # copy equals finite differences; 0.001 leaves it at 1e2 to 1e5.
 SOFT_SMOOTHING = 0.2
-# Converged: over the last tenth of the steps the pose moved the cloud by less than this share of a point spacing.
-SETTLED_MOVE = 0.1
 # What a stage must see at least: a plane has three, and one more shows its other side.
 FEWEST_POINTS = 4
 
@@ -87,7 +86,8 @@ class Stage(nn.Module):
         motion = self.chart.motion(end.state, reached.frame)
         final = end.temperature if self.temperature.learned else self.temperature.at(1.0, problem.unit)
         loss = value(problem, motion, final)
-        settled = _settled(self.chart.motion(earlier, frame), motion, pair)
+        with torch.no_grad():
+            settled = moved_little(self.chart.motion(earlier, frame), motion, pair)
         return StageResult(reached.frame.leave(motion), loss, final * frame.scale, end.gradient_norm, settled)
 
     def wanted(self, pair: CloudPair) -> bool:
@@ -135,12 +135,3 @@ def _check(loss: Loss, inner: object, temperature: object, points: object, above
         raise ValueError(f"inner is {inner!r}; it must be Adam(...) or GaussNewton(...)")
     if isinstance(temperature, Unrounded) and isinstance(loss, SoftLoss):
         raise ValueError(f"temperature is Unrounded(), and {loss!r} divides by it: try Annealed()")
-
-
-@torch.no_grad()
-def _settled(earlier: RigidMotion, final: RigidMotion, pair: CloudPair) -> Tensor:
-    """Whether the cloud's rim moved by less than a share of the point spacing between two motions, ``(batch,)``."""
-    _, radius = centre_and_radius(pair.Q, pair.Q_mask)
-    turn = torch.linalg.matrix_norm(final.rotation - earlier.rotation) / 2**0.5
-    shift = torch.linalg.vector_norm(final.translation - earlier.translation, dim=-1)
-    return turn * radius + shift < SETTLED_MOVE * pair.known_spacing()

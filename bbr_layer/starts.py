@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bbr_layer.alike import leaders, moved_little
 from bbr_layer.backward import Detached
 from bbr_layer.descent import descended
 from bbr_layer.geometry import RigidMotion
@@ -94,14 +95,40 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
         places = RigidMotion(turned.reshape(-1, d, d), entered.translation.repeat_interleave(count, 0))
         hot = _heated(stages[0], torch.arange(count, device=turned.device).repeat(batch) > 0)
         run = [hot, *(stage for stage in stages[1:] if stage.wanted(several))]
-        ended = descended(run, (several, frames), frames.leave(places), Detached())
-        scores = score(several, frames.enter(ended.motion)).nan_to_num(nan=-torch.inf).reshape(batch, count)
+        ended, scores = _tried(run, (several, frames), frames.leave(places), count)
+        scores = scores.nan_to_num(nan=-torch.inf).reshape(batch, count)
         scores[:, 0] *= 1 + RELUCTANCE
         chosen = scores.argmax(1)
     items = torch.arange(batch, device=turned.device)
     begun = frame.leave(RigidMotion(turned[items, chosen], entered.translation))
     whole = pair.P.shape == clouds[0].P.shape and pair.Q.shape == clouds[0].Q.shape
     return Chosen(begun, _heated(stages[0], chosen > 0), _of(ended, items * count + chosen) if whole else None)
+
+
+def _tried(
+    run: list[Stage], clouds: tuple[CloudPair, Frame], begun: RigidMotion, count: int
+) -> tuple[StageResult, Tensor]:
+    """Where the stages end from each of ``count`` starts per item, and the scores there.
+
+    Of starts that the first stage brings to the same place one goes on for all.
+    """
+    pair, frame = clouds
+    ended = descended(run[:1], clouds, begun, Detached())
+    if len(run) == 1:
+        return ended, score(pair, frame.enter(ended.motion))
+    rotation, translation = (x.unflatten(0, (-1, count)) for x in frame.enter(ended.motion))
+    one, other = RigidMotion(rotation[:, :, None], translation[:, :, None]), (rotation[:, None], translation[:, None])
+    first = leaders(moved_little(one, RigidMotion(*other), _rows(pair, slice(None, None, count))))
+    first = first + count * torch.arange(len(first), device=first.device)[:, None]
+    kept, followed = first.flatten().unique(return_inverse=True)
+    pair, frame = _rows(pair, kept), Frame(*(x[kept] for x in frame))
+    ended = descended(run[1:], (pair, frame), ended.motion.item(kept), Detached())
+    return _of(ended, followed), score(pair, frame.enter(ended.motion))[followed]
+
+
+def _rows(pair: CloudPair, rows: Tensor | slice) -> CloudPair:
+    """Some items of a pair."""
+    return CloudPair._make(None if x is None else x[rows] for x in pair)
 
 
 def _of(ended: StageResult, rows: Tensor) -> StageResult:

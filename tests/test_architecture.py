@@ -37,7 +37,7 @@ ORDER = {
         kernels.soft
         loss_base
         losses
-        matches directions start door thinning
+        matches directions start door thinning alike
         confidence resistance
         registration
         inner

@@ -73,7 +73,7 @@ def test_starts_are_compared_on_few_points_and_without_the_stages_for_many():
     frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
     fine, large = _Seen(BuddyFilter(), Adam(3, 0.005)), _Seen(BuddyFilter(), Adam(3, 0.005), above=100)
     best_start(7, [named_stage("softBBS", points=50), fine, large], (pair, frame), RigidMotion.identity(3, (1,)))
-    assert fine.seen[0] == 7 and 40 <= fine.seen[1] <= 50
+    assert 1 <= fine.seen[0] <= 7 and 40 <= fine.seen[1] <= 50
     assert not hasattr(large, "seen")
 
 
