@@ -31,7 +31,7 @@ class BBRLayer(nn.Module):
         ``"softBD"``, ``"N"``, ``"F"`` for a single scale-free stage. None: the measured default, softBBS then F.
     starts: how many starting rotations are tried as one batch, 1 or more, on as few points as the first stage sees. The
         one kept ends with most buddies on each other's planes (softBBS without normals). The gradient is that of the
-        run from there; the choice has none. ``BBRLayer.robust()`` tries 7, which costs five to six times as much.
+        run from there; the choice has none. ``BBRLayer.robust()`` tries 7, which costs about five times as much.
     backward: how gradients reach the inputs: ``Replay()`` (default, exact), ``Truncated(last_steps)``,
         ``Implicit()``, ``Autograd()`` (second derivatives) or ``Detached()``.
     inner, temperature: settings of the one stage that is given by name.
