@@ -11,10 +11,9 @@ from bbr_layer.cloud_trees import tree_of
 from bbr_layer.embedding import matrices_in_space
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.margins import Margins, MutualMargins, Pose
+from bbr_layer.threads import side_by_side
+from bbr_layer.tiles import Tiled, nearest_by_tiles
 from bbr_layer.trees import Tree, in_space
-
-# Pairs per tile of the brute-force search on accelerators: 2^24 float32 distances are 64 MiB.
-PAIRS_PER_TILE = 2**24
 
 
 class MutualNeighbours:
@@ -45,7 +44,7 @@ class MutualNeighbours:
         self.P_rows, self.Q_rows = _rows(P, P_mask), _rows(Q, Q_mask)
         self.shape, self.device = Q.shape[:2], Q.device
         # None where a cloud has no real point.
-        self.items: list[MutualMargins | _Tiled | None] = [self._item(P, Q, b, margins) for b in range(len(P))]
+        self.items: list[MutualMargins | Tiled | None] = [self._item(P, Q, b, margins) for b in range(len(P))]
 
     @property
     def asked(self) -> int:
@@ -72,17 +71,20 @@ class MutualNeighbours:
         motion: ``target_from_source`` of the moment, one per batch item.
         """
         motion = motion.detach()
+        nearest = torch.zeros(self.shape, dtype=torch.int64, device=self.device)
+        mutual = nearest.bool()
         if self.device.type == "cpu":
             rotation = matrices_in_space(motion.rotation.double().numpy())
             translation = in_space(motion.translation.double().numpy())
-            found = [self.of_item(b, pose) for b, pose in enumerate(zip(rotation, translation, strict=True))]
-            tables = [(torch.from_numpy(index), torch.from_numpy(mutual)) for index, mutual in found]
+            tables = nearest.numpy(), mutual.numpy()
+
+            def work(b: int) -> None:
+                tables[0][b], tables[1][b] = self.of_item(b, (rotation[b], translation[b]))
+
+            side_by_side(work, len(self.items))
         else:
-            tables = [self._tiled(b, motion.item(b)) for b in range(len(self.items))]
-        nearest = torch.zeros(self.shape, dtype=torch.int64, device=self.device)
-        mutual = nearest.bool()
-        for b, (index, both) in enumerate(tables):
-            nearest[b], mutual[b] = index, both
+            for b in range(len(self.items)):
+                nearest[b], mutual[b] = self._tiled(b, motion.item(b))
         return nearest, mutual
 
     def of_item(self, number: int, pose: Pose) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
@@ -121,14 +123,14 @@ class MutualNeighbours:
         item, P_rows, Q_rows = self.items[number], self.P_rows[number], self.Q_rows[number]
         nearest = torch.zeros(self.shape[1], dtype=torch.int64, device=self.device)
         mutual = nearest.bool()
-        if isinstance(item, _Tiled):
+        if isinstance(item, Tiled):
             index, both = item(motion)
             rows = slice(None) if Q_rows is None else torch.from_numpy(Q_rows).to(self.device)
             nearest[rows] = index if P_rows is None else torch.from_numpy(P_rows).to(self.device)[index]
             mutual[rows] = both
         return nearest, mutual
 
-    def _item(self, P: Tensor, Q: Tensor, number: int, margins: bool) -> "MutualMargins | _Tiled | None":
+    def _item(self, P: Tensor, Q: Tensor, number: int, margins: bool) -> "MutualMargins | Tiled | None":
         sides = (P, self.P_rows[number]), (Q, self.Q_rows[number])
         if not all(points.shape[1] if rows is None else len(rows) for points, rows in sides):
             return None
@@ -136,9 +138,9 @@ class MutualNeighbours:
             trees = [_tree(points, number, rows) for points, rows in sides]
             return MutualMargins(trees[0], trees[1], margins)
         clouds = [_real(points.detach()[number], rows) for points, rows in sides]
-        return _Tiled(clouds[0], clouds[1])
+        return Tiled(clouds[0], clouds[1])
 
-    def _sides(self) -> "Iterator[Margins | _Tiled]":
+    def _sides(self) -> "Iterator[Margins | Tiled]":
         for item in self.items:
             if isinstance(item, MutualMargins):
                 yield from (item.forth, item.back)
@@ -175,26 +177,3 @@ def _real(item: Tensor, rows: np.ndarray | None) -> Tensor:
 def _tree(points: Tensor, number: int, rows: np.ndarray | None) -> Tree:
     """Over the real points of an item; one for all who ask where that is all of them."""
     return tree_of(points, number) if rows is None else Tree(points[number].detach().double().numpy()[rows])
-
-
-class _Tiled:
-    """One pair of clouds on an accelerator: explicit differences, a tile of queries at a time."""
-
-    def __init__(self, P: Tensor, Q: Tensor):
-        self.P, self.Q = P, Q
-        self.asked = self.searched = self.looked_up = 0
-
-    def __call__(self, motion: RigidMotion) -> tuple[Tensor, Tensor]:
-        """Indices of the nearest target points and whether the choice is mutual, both ``(m,)``."""
-        dtype = motion.translation.dtype
-        P, Q = self.P.to(dtype), self.Q.to(dtype)
-        index = nearest_by_tiles(motion(Q), P)
-        nearest_Q = nearest_by_tiles(motion.inverse()(P), Q)
-        self.asked = self.searched = self.looked_up = self.asked + len(P) + len(Q)
-        return index, nearest_Q[index] == torch.arange(len(Q), device=Q.device)
-
-
-def nearest_by_tiles(queries: Float[Tensor, "k d"], points: Float[Tensor, "n d"]) -> Int[Tensor, "k"]:
-    """Index of the nearest point for each query, the first of equally near ones."""
-    rows = max(1, PAIRS_PER_TILE // len(points))
-    return torch.cat([(tile[:, None, :] - points).square().sum(-1).argmin(1) for tile in queries.split(rows)])

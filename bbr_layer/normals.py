@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bbr_layer.arrays import numpy_too
 from bbr_layer.neighbourhoods import nearest_neighbours
+from bbr_layer.threads import side_by_side
 
 COMPILED = importlib.util.find_spec("numba") is not None
 # Neighbours (the point itself included) of the plane fit when normals are not given. Measured: 8 of the sparse
@@ -16,6 +17,8 @@ COMPILED = importlib.util.find_spec("numba") is not None
 NORMAL_NEIGHBOURS = 8
 # Two eigenvalues closer than this share of the largest leave the normal undetermined: its gradient is then 0.
 EIGENVALUE_GAP = 1e-6
+# Points whose planes one thread fits at once: some milliseconds of work.
+ROWS_AT_ONCE = 4096
 
 
 @numpy_too
@@ -73,10 +76,20 @@ def _axes(points: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         return torch.linalg.eigh(_covariance(points, index))
     from bbr_layer.kernels import cpu_axes  # only where it is used: Numba takes long to load
 
-    clouds = zip(points.detach().double().numpy(), index.numpy(), strict=True)
-    found = [cpu_axes.axes(cloud, rows) for cloud, rows in clouds]
-    variances, axes = (torch.from_numpy(np.stack(x)) for x in zip(*found, strict=True))
-    return variances, axes
+    clouds, rows = points.detach().double().numpy(), index.numpy()
+    batch, n = points.shape[:2]
+    variances, axes = np.empty((batch, n, 3)), np.empty((batch, n, 3, 3))
+    per_cloud = -(-n // ROWS_AT_ONCE)
+
+    def work(number: int) -> None:
+        b, part = (
+            number // per_cloud,
+            slice(ROWS_AT_ONCE * (number % per_cloud), ROWS_AT_ONCE * (number % per_cloud + 1)),
+        )
+        cpu_axes.axes(clouds[b], rows[b, part], variances[b, part], axes[b, part])
+
+    side_by_side(work, batch * per_cloud)
+    return torch.from_numpy(variances), torch.from_numpy(axes)
 
 
 def _first_order(covariance: Tensor, variances: Tensor, axes: Tensor) -> Tensor:

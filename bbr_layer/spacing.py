@@ -37,32 +37,34 @@ def point_spacing(
     """
     batch, (n, d) = points.shape[:-2], points.shape[-2:]
     flat = points if len(batch) == 1 else points.reshape(-1, n, d)
+    if not n or not len(flat):
+        return points.new_zeros(batch, dtype=torch.float64)
     if mask is None:
-        items = [_item_spacing(item, known_tree(flat, b)) for b, item in enumerate(flat)]
-    else:
-        items = [_item_spacing(item[kept]) for item, kept in zip(flat, mask.reshape(-1, n), strict=True)]
-    return torch.stack(items).reshape(batch) if items else points.new_zeros(batch, dtype=torch.float64)
+        return _spacing(flat, [known_tree(flat, b) for b in range(len(flat))]).reshape(batch)
+    kept = [item[real][None] for item, real in zip(flat, mask.reshape(-1, n), strict=True)]
+    items = [_spacing(item, [None]) if item.shape[1] else item.sum((1, 2)).double() for item in kept]
+    return torch.cat(items).reshape(batch)
 
 
-def _item_spacing(points: Float[Tensor, "n d"], tree: Tree | None = None) -> Float[Tensor, ""]:
-    """``point_spacing`` of one cloud without padding."""
-    n, asked = len(points), min(len(points), SPACING_POINTS)
-    if not n:
-        return points.new_zeros((), dtype=torch.float64)
+def _spacing(points: Float[Tensor, "batch n d"], trees: list[Tree | None]) -> Float[Tensor, "batch"]:
+    """``point_spacing`` of clouds without padding, at least one point each."""
+    n = points.shape[1]
+    asked = min(n, SPACING_POINTS)
     rows = torch.arange(asked, device=points.device) * n // asked
-    some = points[rows]
-    index = _neighbours(points, rows, tree)
-    squared = (points[index].double() - some[:, None].double()).square().sum(-1)
+    index = torch.stack([_neighbours(item, rows, tree) for item, tree in zip(points, trees, strict=True)])
+    others = points[torch.arange(len(points), device=points.device)[:, None, None], index]
+    squared = (others.double() - points[:, rows, None].double()).square().sum(-1)
     distinct = squared.detach() > 0
     first = distinct.to(torch.int8).argmax(-1, keepdim=True)  # the nearest neighbour that is not a duplicate
     usable = distinct.any(-1)
     distance = smooth_root(squared.gather(-1, first)[..., 0])
-    median = torch.where(usable, distance, torch.nan).nanmedian()
-    return torch.where(usable.any(), median, 0.0)
+    median = torch.where(usable, distance.detach(), torch.nan).nanmedian(-1, keepdim=True).values
+    middle = usable & (distance.detach() == median)  # of several the derivative is the mean
+    return torch.where(middle, distance, 0.0).sum(-1) / middle.sum(-1).clamp(min=1)
 
 
 def _neighbours(points: Tensor, rows: Tensor, tree: Tree | None) -> Tensor:
-    """The nearest others of the points in ``rows``; from the tree's lists where it has them already."""
-    if tree is not None and tree.listed:
+    """The nearest others of the points in ``rows``; from the tree's lists where it has them, or all points ask."""
+    if tree is not None and (tree.listed or len(rows) == len(points)):
         return listed(tree, SPACING_NEIGHBOURS + 1)[rows, 1:]
     return neighbours_of(points[rows], points, SPACING_NEIGHBOURS + 1, tree)[..., 1:]

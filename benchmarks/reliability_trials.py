@@ -41,6 +41,8 @@ PAIRS = (
     ("indoor", "pair_3dmatch_hotel3_15_8"),
     ("indoor", "pair_3dmatch_geotransformer_demo"),
 )
+# Points of the clouds of which only some are judged: three times as many as those.
+LARGE = 6000
 
 
 class Trial(NamedTuple):
@@ -79,6 +81,10 @@ def trials(seeds: int) -> Iterator[Trial]:
             yield Trial(group, f"{name} {first} {second}", sampling, counts[seed % len(counts)], degrees, seed)
     for (group, name), degrees, seed in product(PAIRS, ANGLES_DEG, range(seeds)):
         yield Trial(group, name, ("own", "shared")[seed % 2], (500, 1000)[seed % 2], degrees, seed)
+    for name, sampling, degrees in product(MODELS, SAMPLINGS[::2], ANGLES_DEG):
+        yield Trial(name, name, sampling, LARGE, degrees, 0)
+    for (group, name), degrees in product(PAIRS, ANGLES_DEG):
+        yield Trial(group, name, "own", LARGE, degrees, 0)
 
 
 def clouds(trial: Trial) -> Clouds:

@@ -12,12 +12,12 @@ PROJECT = Path(__file__).resolve().parent.parent
 # "__init__" is the package's public face. A new file needs its name in a row.
 ORDER = {
     "bbr_layer": """
-        checks arrays
+        checks arrays threads
         rotations
         geometry
-        embedding pair trees
+        embedding pair trees tiles
         kernels
-        kernels.cpu_math kernels.cpu_threads
+        kernels.cpu_math
         kernels.cpu_walk kernels.cpu_turns kernels.cpu_axes
         kernels.cpu_adam kernels.cpu_mutual
         margins

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from bbr_layer import Adam, BBRLayer, CloudPair, Detached, RigidMotion, estimate_normals, margins
 from bbr_layer.neighbourhoods import nearest_neighbours
-from bbr_layer.neighbours import MutualNeighbours, nearest_by_tiles
+from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.searches import search_of
 from bbr_layer.spacing import SPACING_POINTS, point_spacing
+from bbr_layer.tiles import nearest_by_tiles
 
 
 def first_nearest(queries: Tensor, points: Tensor) -> Tensor:
@@ -237,7 +238,7 @@ def test_a_copy_searches_on():
 
 
 def test_tiles_find_the_same(monkeypatch):
-    monkeypatch.setattr("bbr_layer.neighbours.PAIRS_PER_TILE", 100)
+    monkeypatch.setattr("bbr_layer.tiles.PAIRS_PER_TILE", 100)
     queries, points = torch.rand(33, 3, dtype=torch.float64), torch.rand(21, 3, dtype=torch.float64)
     assert torch.equal(nearest_by_tiles(queries, points), first_nearest(queries, points))
 

@@ -16,8 +16,8 @@ from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.once import once
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace
 from bbr_layer.kernels.cpu_course import Adjoint
-from bbr_layer.kernels.cpu_threads import side_by_side
 from bbr_layer.pair import CloudPair
+from bbr_layer.threads import side_by_side
 from bbr_layer.trees import in_space
 
 Tables = TypeVar("Tables", Trace, Back, Adjoint)

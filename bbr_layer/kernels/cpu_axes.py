@@ -54,9 +54,8 @@ def _diagonalise(matrix, vectors):  # type: ignore[no-untyped-def]
 
 
 @exact
-def axes(points, index):  # type: ignore[no-untyped-def]
-    """Variances ``(n, 3)``, least first, along the axes ``(n, 3, 3)``, by column, of every row of ``index (n, k)``."""
-    variances, vectors = np.empty((len(index), 3)), np.empty((len(index), 3, 3))
+def axes(points, index, variances, vectors):  # type: ignore[no-untyped-def]
+    """Of every row of ``index (n, k)`` the variances ``(n, 3)``, least first, along ``vectors (n, 3, 3)`` by column."""
     matrix, turned = np.empty((3, 3)), np.empty((3, 3))
     for i in range(len(index)):
         _covariance(points, index[i], matrix)
@@ -66,4 +65,3 @@ def axes(points, index):  # type: ignore[no-untyped-def]
             variances[i, a] = matrix[order[a], order[a]]
             for k in range(3):
                 vectors[i, k, a] = turned[k, order[a]]
-    return variances, vectors

@@ -24,7 +24,7 @@ from bbr_layer.kernels.cpu_items import (
 )
 from bbr_layer.kernels.cpu_math import COLUMN_OUT, KEPT_PAIRS, ROW_OUT
 from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators
-from bbr_layer.kernels.cpu_threads import side_by_side
+from bbr_layer.threads import side_by_side
 
 # A single item is cut into at most this many parts, of at least this many pairs each.
 MOST_PARTS, PAIRS_PER_PART = 8, 2**17

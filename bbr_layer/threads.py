@@ -10,7 +10,7 @@ import torch
 def side_by_side(work: Callable[[int], None], count: int) -> None:
     """``work(0)`` to ``work(count - 1)`` on as many threads as torch is set to."""
     threads = min(torch.get_num_threads(), count)
-    if threads == 1:
+    if threads <= 1:
         for number in range(count):
             work(number)
     else:
@@ -18,13 +18,27 @@ def side_by_side(work: Callable[[int], None], count: int) -> None:
             assert done is None
 
 
+def library_threads() -> int:
+    """On how many threads a library may work that has OpenMP start them: as many as torch is set to.
+
+    One in a forked process, a worker of a data loader, say: OpenMP waits there for its parent's threads for ever.
+    """
+    return 1 if _FORKED else torch.get_num_threads()
+
+
 _POOLS: dict[int, ThreadPoolExecutor] = {}
+_FORKED: list[bool] = []
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
     return _POOLS.setdefault(threads, ThreadPoolExecutor(threads, thread_name_prefix="bbr_layer"))
 
 
-# A forked process (a worker of a data loader) has none of its parent's threads.
+def _forked() -> None:
+    """A forked process has none of its parent's threads."""
+    _POOLS.clear()
+    _FORKED.append(True)
+
+
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_POOLS.clear)
+    os.register_at_fork(after_in_child=_forked)
