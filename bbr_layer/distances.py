@@ -5,6 +5,8 @@ distances that decide who is whose best buddy; through an unrolled registration 
 percent of the gradient.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,6 +25,14 @@ def smooth_root(squared: Tensor, floor: Tensor | float = 0.0) -> Tensor:
     total = squared + torch.as_tensor(floor, dtype=squared.dtype, device=squared.device).square()
     positive = total > 0
     return torch.where(positive, torch.where(positive, total, 1.0).sqrt(), 0.0)
+
+
+def flattened(distance: Tensor, temperature: Tensor, reach: float) -> Tensor:
+    """``distance / (1 + distance / (reach * temperature))``: as it is where it is small, and never over the product.
+
+    What Geman and McClure do to squares, done to lengths. An infinite ``reach`` changes nothing.
+    """
+    return distance / (1 + distance / (reach * temperature)) if math.isfinite(reach) else distance
 
 
 def squared_distances(P: Float[Tensor, "*batch n c"], Q: Float[Tensor, "*batch m c"]) -> Float[Tensor, "*batch n m"]:

@@ -3,12 +3,14 @@
 A loss is called with a ``CloudPair`` whose source has been moved, and a temperature ``(batch,)``.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bbr_layer.buddies import OUTLIER_CONSTANT
-from bbr_layer.distances import matched_plane_normals, smooth_root, symmetric_point_to_plane
+from bbr_layer.distances import flattened, matched_plane_normals, smooth_root, symmetric_point_to_plane
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.scene import Kernel, SoftTerms
@@ -124,9 +126,25 @@ class BuddyFilter(Loss):
     Normals of a pair are turned to one side first. The temperature is the length below which the absolute value is
     rounded off, ``sqrt(r^2 + temperature^2)``; at 0 it is the paper's, whose own curvature is 0 almost everywhere.
     No buddies: the loss is 0 and so is its gradient.
+
+    Parameters
+    ----------
+    smoothing: not used: F is rounded off by its temperature.
+    reach: a distance d counts as ``d / (1 + d / (reach * temperature))``, so that pairs of different surfaces, which
+        lie far apart, hardly pull. Default infinite, the printed equation; the layer's default has 50: benchmarks/reach.md.
+
+    Raises
+    ------
+    ValueError: a reach that is not positive.
     """
 
     needs_normals = True
+
+    def __init__(self, smoothing: float = 0.0, *, reach: float = math.inf):
+        super().__init__(smoothing)
+        if not reach > 0:
+            raise ValueError(f"reach is {reach}; it is a length in temperatures and positive: try 50, or math.inf")
+        self.reach = reach
 
     def objective(self, pair: CloudPair) -> Objective:
         search = search_of(pair)
@@ -138,11 +156,11 @@ class BuddyFilter(Loss):
 
     def kernel(self, pair: CloudPair) -> Kernel:
         pair.both_normals()
-        return MatchedKernel(search_of(pair))
+        return MatchedKernel(search_of(pair), self.reach)
 
     def squares(self, pair: CloudPair) -> Squares:
         pair.both_normals()
-        return MatchedSquares(search_of(pair))
+        return MatchedSquares(search_of(pair), self.reach)
 
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         search = search_of(pair)
@@ -150,7 +168,8 @@ class BuddyFilter(Loss):
         return self._matched(pair, temperature, *search(still))
 
     def extra_repr(self) -> str:
-        return f"smoothing={self.smoothing}" if self.smoothing else ""
+        told = [f"smoothing={self.smoothing}"] if self.smoothing else []
+        return ", ".join([*told, f"reach={self.reach:g}"] if math.isfinite(self.reach) else told)
 
     def _matched(self, pair: CloudPair, temperature: Tensor, index: Tensor, mutual: Tensor) -> Tensor:
         P_normals, Q_normals = pair.both_normals()
@@ -161,7 +180,8 @@ class BuddyFilter(Loss):
             weights = weights * pair.P_weights.gather(1, index)
         if pair.Q_weights is not None:
             weights = weights * pair.Q_weights
-        distances = smooth_root(residual.square(), temperature.to(residual.dtype)[:, None])
+        rounding = temperature.to(residual.dtype)[:, None]
+        distances = flattened(smooth_root(residual.square(), rounding), rounding, self.reach)
         return weighted_mean(distances[:, None], weights[:, None])
 
 

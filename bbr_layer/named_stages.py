@@ -17,6 +17,9 @@ SOFT_POINTS, FAST_SOFT_POINTS = 1000, 300
 # Points of each cloud that F begins on: its basin is as wide as the points are sparse. Chosen on the distractor of
 # docs/experiments.md, Fig. 5.
 FIRST_POINTS = 1000
+# Temperatures beyond which a pair hardly pulls in F: at the end 1.5 point spacings of Eq. 7, which adds two normals.
+# Measured: half the error beside a distractor, about the same on whole models; benchmarks/reach.md.
+REACH = 50.0
 # Points of each cloud that most of F's steps see; the last few see all. Chosen: a twelfth of a full lidar scan.
 FINE_POINTS = 10_000
 
@@ -27,17 +30,25 @@ def default_stages(soft_points: int = SOFT_POINTS) -> list[Stage]:
     Of more than 1000 points F sees as many at first; of more than 10 000 it then sees those, and all in the last 30
     steps.
     """
-    first = named_stage("F", points=FIRST_POINTS, above=FIRST_POINTS)
-    last = named_stage("F", Adam(30, 0.001), above=FINE_POINTS)
-    return [named_stage("softBBS", points=soft_points), first, named_stage("F", points=FINE_POINTS), last]
+    soft = named_stage("softBBS", points=soft_points)
+    first = _filter_stage(points=FIRST_POINTS, above=FIRST_POINTS)
+    return [soft, first, _filter_stage(points=FINE_POINTS), _filter_stage(Adam(30, 0.001), above=FINE_POINTS)]
 
 
 def fast_stages(soft_points: int = FAST_SOFT_POINTS) -> list[Stage]:
     """The same with soft buddies of fewer points and Gauss-Newton instead of most steps."""
     soft = named_stage("softBBS", Adam(40, 0.1), points=soft_points)
-    first = named_stage("F", GaussNewton(8), points=FIRST_POINTS, above=FIRST_POINTS)
-    last = named_stage("F", GaussNewton(3), Annealed(0.1, 0.03), above=FINE_POINTS)
-    return [soft, first, named_stage("F", GaussNewton(8), points=FINE_POINTS), last]
+    first = _filter_stage(GaussNewton(8), points=FIRST_POINTS, above=FIRST_POINTS)
+    last = _filter_stage(GaussNewton(3), Annealed(0.1, 0.03), above=FINE_POINTS)
+    return [soft, first, _filter_stage(GaussNewton(8), points=FINE_POINTS), last]
+
+
+def _filter_stage(
+    inner: Inner | None = None, temperature: Temperature | None = None, *, points: int | None = None, above: int = 0
+) -> Stage:
+    """F by name, but of a finite reach."""
+    plain = named_stage("F", inner, temperature)
+    return Stage(BuddyFilter(reach=REACH), plain.inner, plain.temperature, points=points, above=above)
 
 
 def named_stage(

@@ -1,5 +1,6 @@
 """One stage of the layer: a loss, the optimiser that lowers it, and its temperature; and the stages by name."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -16,6 +17,7 @@ from bbr_layer.inner.run import run
 from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.inner.unroll import Problem, cut_from_graph, value
 from bbr_layer.loss_base import Loss, Objective, SoftLoss
+from bbr_layer.losses import BuddyFilter
 from bbr_layer.pair import CloudPair, Frame
 from bbr_layer.registration import StageResult
 from bbr_layer.temperature import Annealed, Temperature, Unrounded
@@ -135,3 +137,5 @@ def _check(loss: Loss, inner: object, temperature: object, points: object, above
         raise ValueError(f"inner is {inner!r}; it must be Adam(...) or GaussNewton(...)")
     if isinstance(temperature, Unrounded) and isinstance(loss, SoftLoss):
         raise ValueError(f"temperature is Unrounded(), and {loss!r} divides by it: try Annealed()")
+    if isinstance(temperature, Unrounded) and isinstance(loss, BuddyFilter) and math.isfinite(loss.reach):
+        raise ValueError(f"temperature is Unrounded(), and the reach of {loss!r} a multiple of it: try Annealed()")

@@ -85,6 +85,15 @@ def buddy_filter(D, D_normal, weights=None):
     return top / sum(B[i, j] * _weight(weights, i, j) for i, j in pairs)
 
 
+def flattened(D, width):
+    """A distance d counts as d / (1 + d / width)."""
+    flat = torch.empty_like(D)
+    for i in range(D.shape[0]):
+        for j in range(D.shape[1]):
+            flat[i, j] = D[i, j] / (1 + D[i, j] / width)
+    return flat
+
+
 def normal_equations(residuals, counts):
     """sum of c J J^T and of c r J over residuals r_k, given as a function of six (in the plane three) pose numbers.
 

@@ -34,6 +34,7 @@ LOSSES = {
         SoftTerms(False, outlier=EPS, match="both", feature_weight=0.7),
     ),
     "F": (BuddyFilter(), None),
+    "F, reach": (BuddyFilter(reach=1.3), None),
 }
 
 
@@ -65,7 +66,7 @@ def test_closed_form_is_plain_differentiation(name, d, masked, rows, monkeypatch
     loss, terms = LOSSES[name]
     pair, at, temperature = _scene(d, masked)
     search = MutualNeighbours(pair.P, pair.Q, pair.P_mask, pair.Q_mask)
-    kernel = MatchedKernel(search) if terms is None else SoftKernel(terms)
+    kernel = MatchedKernel(search, loss.reach) if terms is None else SoftKernel(terms)
     found = PairKernel(kernel, pair, loss.smoothing * pair.spacing).slope(at, temperature)
     value = loss.objective(pair)(at, temperature)
     wanted = (value, *torch.autograd.grad(value.sum(), (*at, temperature), create_graph=True))

@@ -6,7 +6,8 @@ from torch import Tensor
 from bbr_layer.kernels import cpu_matched_course
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
 from bbr_layer.kernels.cpu_course import Adjoint
-from bbr_layer.kernels.cpu_matched import add_adjoint, add_weights, matched_clouds, slope_of
+from bbr_layer.kernels.cpu_matched import matched_clouds, slope_of
+from bbr_layer.kernels.cpu_matched_adjoint import add_adjoint, add_weights
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.pair import CloudPair
 
@@ -23,7 +24,7 @@ class MatchedScene:
 
     def __init__(self, kernel: MatchedKernel, pair: CloudPair, rounding: Tensor):
         self.search = kernel.search
-        self.clouds = matched_clouds(pair)
+        self.clouds = matched_clouds(pair, kernel.reach)
 
     def walk(self, number: int, course: Course, trace: Trace) -> None:
         """Take item ``number`` along all steps of the course."""

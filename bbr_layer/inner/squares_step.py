@@ -44,14 +44,14 @@ class BoundSquares:
 
     def values(self, motion: RigidMotion, temperature: Tensor, held: tuple[Tensor, ...]) -> Equations:
         """The normal equations without a graph, compiled where they can be."""
-        matched = isinstance(self.squares, MatchedSquares) and self.pair.P.device.type == "cpu"
-        if not matched or backend("cpu").name != "numba":
+        compiled = self.pair.P.device.type == "cpu" and backend("cpu").name == "numba"
+        if not isinstance(self.squares, MatchedSquares) or not compiled:
             return self.squares.equations(self.pair.detach(), motion, temperature, held)
         # Imported where it is used: Numba takes long to load, and may be missing.
         from bbr_layer.kernels.cpu_matched import equations_of, matched_clouds
 
         if self._clouds is None:
-            self._clouds = matched_clouds(self.pair)
+            self._clouds = matched_clouds(self.pair, self.squares.reach)
         pose = matrices_in_space(motion.rotation.numpy()), in_space(motion.translation.numpy())
         pairs = zip(*(x.numpy() for x in held), strict=True)
         each = zip(self._clouds, pairs, zip(*pose, strict=True), temperature.tolist(), strict=True)

@@ -3,7 +3,8 @@
 import numpy as np
 
 from bbr_layer.kernels.cpu_adam import advance, retreat
-from bbr_layer.kernels.cpu_matched import add_adjoint, add_weights, slope_of
+from bbr_layer.kernels.cpu_matched import slope_of
+from bbr_layer.kernels.cpu_matched_adjoint import add_adjoint, add_weights
 from bbr_layer.kernels.cpu_math import exact
 from bbr_layer.kernels.cpu_mutual import mutual_pairs
 

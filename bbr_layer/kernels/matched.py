@@ -1,9 +1,11 @@
 """F in closed form: everything happens on the mutual pairs, so its sweeps are as long as the source."""
 
+import math
+
 import torch
 from torch import Tensor
 
-from bbr_layer.distances import matched_plane_normals, smooth_root
+from bbr_layer.distances import flattened, matched_plane_normals, smooth_root
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.forward_mode import along
 from bbr_layer.kernels.scene import Direction, Scene
@@ -17,22 +19,23 @@ class MatchedKernel:
     Parameters
     ----------
     search: finds them.
+    reach: in temperatures, see ``BuddyFilter``. Default infinite.
     """
 
-    def __init__(self, search: MutualNeighbours):
-        self.search = search
+    def __init__(self, search: MutualNeighbours, reach: float = math.inf):
+        self.search, self.reach = search, reach
 
     def gradient(self, scene: Scene, motion: RigidMotion) -> tuple[Tensor, Scene]:
         """Loss ``(batch,)`` and gradient by everything in the scene; see ``Kernel``."""
         index, mutual = self.search(motion)
-        loss, gradient = _gradient(_matched(scene.pair, index), scene.temperature, mutual)
+        loss, gradient = _gradient(_matched(scene.pair, index), scene.temperature, mutual, self.reach)
         return loss, _scattered(gradient, scene.pair, index)
 
     def directional(self, scene: Scene, motion: RigidMotion, direction: Direction) -> tuple[Scene, Scene]:
         """The gradient, and its derivative along ``direction``."""
         index, mutual = self.search(motion)
         matched = scene._replace(pair=_matched(scene.pair, index))
-        found = along(lambda moved: _gradient(moved.pair, moved.temperature, mutual)[1], matched, direction)
+        found = along(lambda at: _gradient(at.pair, at.temperature, mutual, self.reach)[1], matched, direction)
         return _scattered(found[0], scene.pair, index), _scattered(found[1], scene.pair, index)
 
 
@@ -43,7 +46,7 @@ def _matched(pair: CloudPair, index: Tensor) -> CloudPair:
     return pair._replace(P=_gathered(pair.P, index), P_normals=_gathered(P_normals, index), P_weights=weights)
 
 
-def _gradient(pair: CloudPair, temperature: Tensor, mutual: Tensor) -> tuple[Tensor, Scene]:
+def _gradient(pair: CloudPair, temperature: Tensor, mutual: Tensor, reach: float) -> tuple[Tensor, Scene]:
     """Loss and gradient of matched rows; those by P's fields still in the order of Q."""
     P_normals, Q_normals = pair.both_normals()
     offsets = pair.Q - pair.P
@@ -51,7 +54,9 @@ def _gradient(pair: CloudPair, temperature: Tensor, mutual: Tensor) -> tuple[Ten
     signs = torch.where((P_normals * Q_normals).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(planes.dtype)
     residual = (offsets * planes).sum(-1)
     rounding = temperature.to(residual.dtype)[:, None]
-    distances = smooth_root(residual.square(), rounding)
+    rounded = smooth_root(residual.square(), rounding)
+    distances = flattened(rounded, rounding, reach)
+    slope = (distances / torch.where(rounded > 0, rounded, 1.0)).square() if math.isfinite(reach) else 1.0
     P_weights, Q_weights = (1.0 if x is None else x for x in (pair.P_weights, pair.Q_weights))
     real = mutual.to(residual.dtype)
     weights = real * P_weights * Q_weights
@@ -59,7 +64,7 @@ def _gradient(pair: CloudPair, temperature: Tensor, mutual: Tensor) -> tuple[Ten
     inverse = torch.where(total > 0, 1 / torch.where(total > 0, total, 1.0), 0.0)
     loss = (weights * distances).sum(-1, dtype=torch.float64) * inverse
     scaled = weights * inverse.to(residual.dtype)[:, None]
-    over = torch.where(distances > 0, scaled / torch.where(distances > 0, distances, 1.0), 0.0)
+    over = torch.where(rounded > 0, scaled * slope / torch.where(rounded > 0, rounded, 1.0), 0.0)
     force = (over * residual)[..., None]
     excess = (real * (distances - loss.to(residual.dtype)[:, None])) * inverse.to(residual.dtype)[:, None]
     gradient = CloudPair(
@@ -71,6 +76,8 @@ def _gradient(pair: CloudPair, temperature: Tensor, mutual: Tensor) -> tuple[Ten
         Q_weights=None if pair.Q_weights is None else excess * P_weights,
     )
     by_temperature = temperature * over.sum(-1, dtype=torch.float64)
+    if math.isfinite(reach):  # the flattened part of a distance is its share of the reach
+        by_temperature = by_temperature + (scaled * reach * (distances / (reach * rounding)).square()).sum(-1).double()
     return loss, Scene(gradient, by_temperature, torch.zeros_like(temperature))
 
 

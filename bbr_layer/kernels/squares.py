@@ -6,13 +6,14 @@ gradient that of the loss (iteratively reweighted least squares; Holland and Wel
 ``sum(c J J^T) x = -sum(c r J)`` for the turn and shift x of the pose.
 """
 
+import math
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bbr_layer.distances import matched_plane_normals, smooth_root
+from bbr_layer.distances import flattened, matched_plane_normals, smooth_root
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.pair import CloudPair
@@ -44,10 +45,11 @@ class MatchedSquares:
     Parameters
     ----------
     search: finds the pairs.
+    reach: in temperatures, see ``BuddyFilter``. Default infinite.
     """
 
-    def __init__(self, search: MutualNeighbours):
-        self.search = search
+    def __init__(self, search: MutualNeighbours, reach: float = math.inf):
+        self.search, self.reach = search, reach
 
     def hold(self, motion: RigidMotion) -> tuple[Tensor, ...]:
         """Indices of the nearest target points, and which choices are mutual, ``(batch, m)`` each."""
@@ -70,8 +72,9 @@ class MatchedSquares:
         if pair.Q_weights is not None:
             weights = weights * pair.Q_weights
         share = weights / or_one(weights.sum(-1, keepdim=True))
-        distances = smooth_root(residual.square(), temperature.double()[:, None])
-        pull = share / or_one(distances)
+        rounding = temperature.double()[:, None]
+        rounded = smooth_root(residual.square(), rounding)
+        pull = share * (flattened(rounded, rounding, self.reach) / or_one(rounded)).square() / or_one(rounded)
         rows = plane_rows(motion.rotate(pair.Q.double()), turned.double(), offsets, planes)
         pulled = rows * pull[..., None]
         return Equations(pulled.mT @ rows, (pulled * residual[..., None]).sum(1))
