@@ -131,7 +131,8 @@ class BuddyFilter(Loss):
     ----------
     smoothing: not used: F is rounded off by its temperature.
     reach: a distance d counts as ``d / (1 + d / (reach * temperature))``, so that pairs of different surfaces, which
-        lie far apart, hardly pull. Default infinite, the printed equation; the layer's default has 50: benchmarks/reach.md.
+        lie far apart, hardly pull. Default infinite, the printed equation; the layer's default has 50,
+        benchmarks/reach.md.
 
     Raises
     ------
