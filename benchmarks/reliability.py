@@ -16,6 +16,7 @@ from scipy.stats import rankdata
 
 from bbr_layer import atomic_write
 from benchmarks.reliability_runs import read
+from benchmarks.reliability_trials import LARGE
 
 TABLE = Path("benchmarks/reliability.csv")
 RIGHT_DEG, RIGHT_SHARE = 5.0, 0.05
@@ -28,12 +29,13 @@ SURE = 0.9
 CLOSE_SHARE, FEWEST_BUDDIES = 0.75, 0.1
 
 
-def loaded(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Group, right or not, the three shares, and the share of close pairs of every registration."""
+def loaded(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Group, right or not, the three shares, the share of close pairs, and the points of every registration."""
     rows = [row for _, row in sorted(read(path).items())]
     numbers = np.array([row[3:] for row in rows], dtype=float)
     right = (numbers[:, 0] <= RIGHT_DEG) & (numbers[:, 1] <= RIGHT_SHARE)
-    return np.array([row[0] for row in rows]), right, numbers[:, 2:5], numbers[:, 5]
+    points = np.array([int(row[1].split()[-3]) for row in rows])
+    return np.array([row[0] for row in rows]), right, numbers[:, 2:5], numbers[:, 5], points
 
 
 def fitted(shares: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -112,8 +114,8 @@ def main() -> None:
     parser.add_argument("--table", type=Path, default=TABLE)
     parser.add_argument("--out", type=Path, default=Path("docs/reliability"), help="names the .md and the .png")
     options = parser.parse_args()
-    groups, right, shares, close = loaded(options.table)
-    found = held_out(groups, right, shares)
+    groups, right, shares, close, points = loaded(options.table)
+    found, large = held_out(groups, right, shares), points == LARGE
     before = (close >= CLOSE_SHARE) & (shares[:, 0] >= FEWEST_BUDDIES)
     lines = [
         "Made by `python -m benchmarks.reliability`. Each group is judged by a fit to the others.",
@@ -123,6 +125,7 @@ def main() -> None:
         "|---|---|---|---|---|---|---|---|---|",
         *(row(group, found[groups == group], right[groups == group]) for group in np.unique(groups)),
         row("all", found, right),
+        row(f"all of {LARGE} points", found[large], right[large]),
         "",
         f"The share of close pairs, from {CLOSE_SHARE} on, would trust {(before & ~right).sum()} wrong answers and "
         f"doubt {(~before & right).sum()} right ones; as a score its ROC area is {area(close, right):.4f}.",
