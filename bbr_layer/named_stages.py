@@ -22,25 +22,31 @@ FIRST_POINTS = 1000
 REACH = 50.0
 # Points of each cloud that most of F's steps see; the last few see all. Chosen: a twelfth of a full lidar scan.
 FINE_POINTS = 10_000
+# How many, and their rounding in point spacings. Chosen on lidar pairs: 30 steps of Adam at a small rate take longer
+# and end farther off, three iterations a little.
+LAST_ITERATIONS, LAST_ROUNDING = 5, (0.1, 0.03)
 
 
 def default_stages(soft_points: int = SOFT_POINTS) -> list[Stage]:
     """Soft buddies for the basin, then hard ones on planes for the accuracy; scale-free, measured.
 
-    Of more than 1000 points F sees as many at first; of more than 10 000 it then sees those, and all in the last 30
-    steps.
+    Of more than 1000 points F sees as many at first; of more than 10 000 it then sees those, and all in the last five
+    iterations, of Gauss-Newton.
     """
     soft = named_stage("softBBS", points=soft_points)
     first = _filter_stage(points=FIRST_POINTS, above=FIRST_POINTS)
-    return [soft, first, _filter_stage(points=FINE_POINTS), _filter_stage(Adam(30, 0.001), above=FINE_POINTS)]
+    return [soft, first, _filter_stage(points=FINE_POINTS), _last_stage()]
 
 
 def fast_stages(soft_points: int = FAST_SOFT_POINTS) -> list[Stage]:
     """The same with soft buddies of fewer points and Gauss-Newton instead of most steps."""
     soft = named_stage("softBBS", Adam(40, 0.1), points=soft_points)
     first = _filter_stage(GaussNewton(8), points=FIRST_POINTS, above=FIRST_POINTS)
-    last = _filter_stage(GaussNewton(3), Annealed(0.1, 0.03), above=FINE_POINTS)
-    return [soft, first, _filter_stage(GaussNewton(8), points=FINE_POINTS), last]
+    return [soft, first, _filter_stage(GaussNewton(8), points=FINE_POINTS), _last_stage()]
+
+
+def _last_stage() -> Stage:
+    return _filter_stage(GaussNewton(LAST_ITERATIONS), Annealed(*LAST_ROUNDING), above=FINE_POINTS)
 
 
 def _filter_stage(
