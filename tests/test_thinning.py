@@ -1,5 +1,7 @@
 """Fewer points for a stage: even in space, as many as asked for, and differentiable in those that are kept."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,7 @@ from bbr_layer import (
     Unrounded,
     angular_error,
 )
+from bbr_layer.named_stages import REACH
 from bbr_layer.thinning import evenly_thinned, thinned_pair
 
 
@@ -74,14 +77,16 @@ def test_a_large_pair_goes_through_all_stages_and_a_small_one_leaves_the_last_ou
 
 
 @pytest.mark.parametrize("layer", [BBRLayer(backward=Detached()), BBRLayer.fast(Detached())], ids=["default", "fast"])
-def test_f_begins_on_1000_points_where_there_are_more(layer):
-    soft, first, then, last = layer.sequence
+def test_f_begins_as_the_papers_on_at_most_1000_points_and_goes_on_with_a_reach(layer):
+    stages = layer.sequence
     truth, P = motion(3, 0.05, 0.01), bumpy(1010, 3)
-    for count, stages in ((1000, (soft, then)), (1001, (soft, first, then))):
+    for count in (1000, 1010):
         result = layer(P[:count], truth.inverse()(P[:count]))
-        assert result.iterations.item() == sum(stage.inner.steps for stage in stages)
+        assert result.iterations.item() == sum(stage.inner.steps for stage in stages if stage.above < count)
         assert angular_error(result.target_from_source.rotation, truth.rotation) < 1e-3
-    assert first.points == first.above == 1000 and repr(first.loss) == repr(then.loss)
+    assert (stages[1].points, stages[1].above, stages[1].loss.reach) == (1000, 0, math.inf)
+    assert all(stage.loss.reach == REACH for stage in stages[2:])
+    assert {stage.above for stage in stages[2:-1]} <= {0, 1000} and stages[-1].points is None
 
 
 def test_settings_of_a_stage_that_cannot_work_are_refused(as_a_user):
