@@ -82,11 +82,9 @@ def _axes(points: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     per_cloud = -(-n // ROWS_AT_ONCE)
 
     def work(number: int) -> None:
-        b, part = (
-            number // per_cloud,
-            slice(ROWS_AT_ONCE * (number % per_cloud), ROWS_AT_ONCE * (number % per_cloud + 1)),
-        )
-        cpu_axes.axes(clouds[b], rows[b, part], variances[b, part], axes[b, part])
+        b, part = divmod(number, per_cloud)
+        some = slice(ROWS_AT_ONCE * part, ROWS_AT_ONCE * (part + 1))
+        cpu_axes.axes(clouds[b], rows[b, some], variances[b, some], axes[b, some])
 
     side_by_side(work, batch * per_cloud)
     return torch.from_numpy(variances), torch.from_numpy(axes)

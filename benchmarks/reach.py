@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from bbr_layer import BBRLayer, BuddyFilter, Detached, Stage, atomic_write
+from bbr_layer import BBRLayer, BuddyFilter, Detached, atomic_write
 from benchmarks.paper_experiments import EXPERIMENTS, Cell
 
 REACHES = (math.inf, 170.0, 100.0, 50.0, 27.0)
@@ -21,10 +21,10 @@ FIRST_SEED = 1000
 
 
 def layer_of(reach: float) -> BBRLayer:
-    """The default with another reach of every stage of F."""
+    """The default with another reach of F, but for the stage that F begins with."""
     layer = BBRLayer(backward=Detached())
-    for stage in layer.stages:
-        if isinstance(stage, Stage) and isinstance(stage.loss, BuddyFilter):
+    for stage in layer.sequence:
+        if isinstance(stage.loss, BuddyFilter) and math.isfinite(stage.loss.reach):
             stage.loss.reach = reach
     return layer
 

@@ -93,14 +93,15 @@ def test_the_normal_equations_are_the_written_ones(name, d):
         torch.testing.assert_close(found.slope[0], wanted[1], rtol=1e-9, atol=1e-12)
 
 
-def test_the_slope_of_f_is_the_gradient_of_its_loss():
+@pytest.mark.parametrize("loss", [BuddyFilter(), BuddyFilter(reach=1.3)], ids=str)
+def test_the_slope_of_f_is_the_gradient_of_its_loss(loss):
     pair, temperature = as_pair(noisy_pair(3), "normals", "weights"), torch.tensor([0.3], dtype=torch.float64)
     at = RigidMotion(*(x[None] for x in motion(3, 0.1, 0.05)))
     x = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     turn = RigidMotion.from_rotvec(x[:3], torch.zeros(3, dtype=torch.float64)).rotation
     moved = RigidMotion(turn @ at.rotation, at.translation + x[3:])
-    (wanted,) = torch.autograd.grad(BuddyFilter().objective(pair)(moved, temperature).sum(), x)
-    squares = BuddyFilter().squares(pair)
+    (wanted,) = torch.autograd.grad(loss.objective(pair)(moved, temperature).sum(), x)
+    squares = loss.squares(pair)
     found = squares.equations(pair, at, temperature, squares.hold(at)).slope[0]
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
 

@@ -7,7 +7,7 @@ import reference
 import torch
 from problems import as_pair, bumpy, motion, noisy_pair
 
-from bbr_layer import Adam, Annealed, Autograd, BBRLayer, BuddyFilter, GaussNewton, Replay, RigidMotion, Stage
+from bbr_layer import Adam, Annealed, Autograd, BBRLayer, BuddyFilter, GaussNewton, Replay, Stage
 from bbr_layer.temperature import Unrounded
 
 REACH = 1.3
@@ -70,19 +70,6 @@ def test_replay_is_the_plain_unroll(inner, backend, monkeypatch):
     for one, other in zip(*found, strict=True):
         assert other.abs().max() > 1e-6
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-10 * other.abs().max().item())
-
-
-def test_the_slope_of_gauss_newton_is_the_gradient_of_the_loss():
-    pair, temperature = as_pair(noisy_pair(3), "normals", "weights"), torch.tensor([0.3], dtype=torch.float64)
-    at = RigidMotion(*(x[None] for x in motion(3, 0.1, 0.05)))
-    x = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    turn = RigidMotion.from_rotvec(x[:3], torch.zeros(3, dtype=torch.float64)).rotation
-    moved = RigidMotion(turn @ at.rotation, at.translation + x[3:])
-    loss = BuddyFilter(reach=REACH)
-    (wanted,) = torch.autograd.grad(loss.objective(pair)(moved, temperature).sum(), x)
-    squares = loss.squares(pair)
-    found = squares.equations(pair, at, temperature, squares.hold(at)).slope[0]
-    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
 
 
 def test_a_second_surface_hardly_pulls():
