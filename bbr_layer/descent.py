@@ -20,7 +20,8 @@ def descended(stages: list[Stage], clouds: tuple[CloudPair, Frame], motion: Rigi
     """
     steps, done = sum(stage.inner.steps for stage in stages), 0
     for stage in stages:
-        ended = stage(*clouds, motion, partial(_attached, mode, done, steps), closed_form=mode.closed_form)
+        attached, last = partial(_attached, mode, done, steps), stage is stages[-1]
+        ended = stage(*clouds, motion, attached, closed_form=mode.closed_form, last=last)
         motion, done = ended.motion, done + stage.inner.steps
     return ended
 

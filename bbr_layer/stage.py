@@ -73,12 +73,19 @@ class Stage(nn.Module):
             raise ValueError(f"{found!r} goes with Adam() alone: give GaussNewton() Annealed() and RotationVector()")
 
     def forward(
-        self, pair: CloudPair, frame: Frame, start: RigidMotion, attached: Callable[[int], bool], closed_form: bool
+        self,
+        pair: CloudPair,
+        frame: Frame,
+        start: RigidMotion,
+        attached: Callable[[int], bool],
+        *,
+        closed_form: bool,
+        last: bool,
     ) -> StageResult:
         """Lower the loss of the centred ``pair`` from ``start``.
 
         ``attached(step)`` says which steps keep a graph; ``closed_form`` takes gradients from the kernels instead of
-        differentiating the loss.
+        differentiating the loss; of a stage that is not the ``last`` nobody asks the loss (NaN) and whether it settled.
         """
         pair = thinned_pair(pair, self.points)
         problem = self._problem(pair, frame, closed_form)
@@ -87,9 +94,11 @@ class Stage(nn.Module):
         reached = problem if attached(self.inner.steps - 1) else cut
         motion = self.chart.motion(end.state, reached.frame)
         final = end.temperature if self.temperature.learned else self.temperature.at(1.0, problem.unit)
-        loss = value(problem, motion, final)
-        with torch.no_grad():
-            settled = moved_little(self.chart.motion(earlier, frame), motion, pair)
+        loss, settled = torch.full_like(final, torch.nan), torch.zeros_like(final, dtype=torch.bool)
+        if last:
+            loss = value(problem, motion, final)
+            with torch.no_grad():
+                settled = moved_little(self.chart.motion(earlier, frame), motion, pair)
         return StageResult(reached.frame.leave(motion), loss, final * frame.scale, end.gradient_norm, settled)
 
     def wanted(self, pair: CloudPair) -> bool:

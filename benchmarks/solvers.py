@@ -11,7 +11,6 @@ at larger ones buddies change hands between the two sides.
 
 import argparse
 import math
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from bbr_layer import BBRLayer, Detached, GaussNewton, RigidMotion
 from benchmarks.data import model
-from benchmarks.starts import ANGLES_DEG, FAILURE_DEG, MODELS, error, turned_model
+from benchmarks.starts import ANGLES_DEG, FAILURE_DEG, MODELS, error_and_seconds, turned_model
 
 SIZES = (100, 300, 500)
 DIRECTIONS, STEP = 12, 1e-9
@@ -40,12 +39,10 @@ def layers() -> dict[str, BBRLayer]:
 def registrations(layer: BBRLayer, degrees: float, repeats: int) -> tuple[str, float]:
     """Failures and median error over all models, and seconds of processor time per registration."""
     layer.backward_mode = Detached()
-    errors, before = [], time.process_time()
-    for name in MODELS:
-        cloud = model(name).double()
-        errors += [error(layer, turned_model(cloud, degrees, seed)) for seed in range(repeats)]
-    seconds = (time.process_time() - before) / len(errors)
-    return f"{(np.array(errors) > FAILURE_DEG).sum()}/{len(errors)} | {np.median(errors):.3f}", seconds
+    clouds = [model(name).double() for name in MODELS]
+    trials = (turned_model(cloud, degrees, seed) for cloud in clouds for seed in range(repeats))
+    errors, seconds = np.array([error_and_seconds(layer, trial) for trial in trials]).T
+    return f"{(errors > FAILURE_DEG).sum()}/{len(errors)} | {np.median(errors):.3f}", float(seconds.mean())
 
 
 def gradient_row(layer: BBRLayer, P: Tensor, Q: Tensor) -> str:
@@ -102,7 +99,7 @@ def main() -> None:
     ]
     for name, layer in layers().items():
         cloud = model(MODELS[0]).float()
-        layer(cloud[:50], cloud[50:100])  # what is compiled once does not count
+        layer(cloud[:500], cloud[500:1000])  # what is compiled once does not count
         cells = [registrations(layer, angle, options.repeats) for angle in ANGLES_DEG]
         seconds = np.mean([cell[1] for cell in cells])
         lines.append(f"| {name} | " + " | ".join(cell[0] for cell in cells) + f" | {1000 * seconds:.0f} |")

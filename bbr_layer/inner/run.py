@@ -38,30 +38,35 @@ def run(problem: Problem, start: RigidMotion, attached: Callable[[int], bool], c
     """
     at, steps = begin(problem, start), problem.inner.steps
     tail = math.floor((1 - SETTLED_TAIL) * steps)
-    marks = sorted({0, tail, steps, *(k for k in range(1, steps) if attached(k) != attached(k - 1))})
+    marks = sorted({0, steps, *(k for k in range(1, steps) if attached(k) != attached(k - 1))})
     earlier = detached(at.state)
     for first, last in zip(marks[:-1], marks[1:], strict=True):
-        if first == tail:
-            earlier = detached(at.state)
+        seen = tail if first <= tail < last else first
         if attached(first):
             if first and not attached(first - 1):
                 at = at._replace(state=_fixed(at.state, problem, cut))
-            at = _advance(problem, at, last - first, differentiable=True)
+            at, state = _advance(problem, at, (last, seen), differentiable=True)
         else:
             with torch.no_grad():
-                at = _advance(cut, at.detach(), last - first, differentiable=False)
+                at, state = _advance(cut, at.detach(), (last, seen), differentiable=False)
+        if seen == tail:
+            earlier = state
     if problem.inner.keep == "best":
         at = at._replace(state=at.best_state, temperature=at.best_temperature)
     return at, earlier
 
 
-def _advance(problem: Problem, at: Progress, steps: int, differentiable: bool) -> Progress:
-    look = _look(problem)
+def _advance(problem: Problem, at: Progress, until: tuple[int, int], differentiable: bool) -> tuple[Progress, State]:
+    """Step up to the first number of ``until``; and the state before the step of the second, without a graph."""
+    (last, seen), look = until, _look(problem)
     if look is not None:
-        return _walked(problem, look, at, steps)
-    for _ in range(steps):
+        return _walked(problem, look, at, until)
+    state = detached(at.state)
+    for number in range(at.moments.step, last):
+        if number == seen:
+            state = detached(at.state)
         at = step(problem, at, differentiable)
-    return at
+    return at, state
 
 
 def _look(problem: Problem) -> "Callable[[CloudPair, Tensor], Scene] | None":
@@ -85,21 +90,25 @@ def _look(problem: Problem) -> "Callable[[CloudPair, Tensor], Scene] | None":
     return None
 
 
-def _walked(problem: Problem, look: "Callable[[CloudPair, Tensor], Scene]", at: Progress, steps: int) -> Progress:
+def _walked(
+    problem: Problem, look: "Callable[[CloudPair, Tensor], Scene]", at: Progress, until: tuple[int, int]
+) -> tuple[Progress, State]:
     from bbr_layer.inner.walk import Steps, walk
 
     loss, inner, done, d = problem.loss, problem.inner, at.moments.step, at.state.translation.shape[-1]
     assert isinstance(loss, PairKernel) and isinstance(inner, Adam)
-    numbers = range(done, done + steps)
+    last, seen = until
+    numbers = range(done, last)
     shares = problem.unit.new_tensor([share_done(number, inner.steps) for number in numbers])[:, None]
     temperatures = torch.maximum(problem.temperature.at(shares, problem.unit), floor(problem))
-    temperatures = temperatures.expand(steps, -1)  # Unrounded is one row for all
+    temperatures = temperatures.expand(len(numbers), -1)  # Unrounded is one row for all
     rates = inner.rates((rotation_dimensions(d), d), at.moments.first, numbers)
     begun = (*at.state, at.moments.first, at.moments.second)
-    end = walk(Steps(look, inner, done), (loss.pair, loss.rounding), begun, temperatures, rates)
-    moments = Moments(end.first, end.second, done + steps)
+    end = walk(Steps(look, inner, done, seen), (loss.pair, loss.rounding), begun, temperatures, rates)
+    moments = Moments(end.first, end.second, last)
     state = State(end.rotation, end.translation)
-    return at._replace(state=state, temperature=temperatures[-1], moments=moments, gradient_norm=end.gradient_norm)
+    at = at._replace(state=state, temperature=temperatures[-1], moments=moments, gradient_norm=end.gradient_norm)
+    return at, State(end.seen_rotation, end.seen_translation)
 
 
 def _fixed(state: State, problem: Problem, cut: Problem) -> State:

@@ -46,11 +46,13 @@ class Steps(NamedTuple):
     look: makes the loss's scene from the pair and the rounding ``(batch,)``.
     inner: the optimiser.
     done: steps of this stage taken before.
+    seen: the step of this stage before which the pose is also told.
     """
 
     look: Callable[[CloudPair, Tensor], Scene]
     inner: Adam
     done: int
+    seen: int
 
     def course(self, temperatures: Tensor, rates: Tensor, dimension: int) -> Callable[[int], Course]:
         """How each item goes, from ``(steps, batch)`` and ``(steps, k)``."""
@@ -62,13 +64,18 @@ class Steps(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """Where the steps led: ``(batch, d, d)``, ``(batch, d)``, moments ``(batch, k)``, last gradient's ``(batch,)``."""
+    """Where the steps led: ``(batch, d, d)``, ``(batch, d)``, moments ``(batch, k)``.
+
+    Without a graph: the last gradient's length ``(batch,)``, and the pose before the step that is seen.
+    """
 
     rotation: Tensor
     translation: Tensor
     first: Tensor
     second: Tensor
     gradient_norm: Tensor
+    seen_rotation: Tensor
+    seen_translation: Tensor
 
 
 def walk(
@@ -98,9 +105,9 @@ class _Walk(torch.autograd.Function):
         ctx.steps, ctx.trace = steps, trace
         ctx.save_for_backward(*given)
         norm = torch.from_numpy(np.linalg.norm(trace.gradients[:, -1], axis=1))
-        ctx.mark_non_differentiable(norm)
-        ends = trace.rotations[:, -1], trace.translations[:, -1], trace.firsts[:, -1], trace.seconds[:, -1]
-        return *_free(Back(*ends), d), norm
+        end, seen = _free(_at(trace, -1), d), _free(_at(trace, steps.seen - steps.done), d)[:2]
+        ctx.mark_non_differentiable(norm, *seen)
+        return *end, norm, *seen
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Any, ...]:
@@ -156,6 +163,11 @@ def _zero(batch: int, n: int, m: int) -> Adjoint:
 def _item(tables: Tables, number: int) -> Tables:
     """The same of one item of a batch."""
     return type(tables)(*(table[number] for table in tables))
+
+
+def _at(trace: Trace, step: int) -> Back:
+    """One point of all traces."""
+    return Back(trace.rotations[:, step], trace.translations[:, step], trace.firsts[:, step], trace.seconds[:, step])
 
 
 def _free(point: Back, d: int) -> list[Tensor]:
