@@ -3,10 +3,11 @@
     python -m benchmarks.false_loops [--only v1_pose0 ...] [--again] [--out benchmarks/false_loops.md]
 
 The edges of a sequence are registered once; then wrong loops are added until they are the given share of all loops,
-and the pose graph and the refinement are solved again. ``scattered``: between scans drawn at random,
-each with a motion of its own. ``agreeing``: in groups of four between neighbouring scans, all of a group leading to
-the same wrong place along the chain, as rooms that look alike do. A wrong loop has the information, centre and score of
-a right edge. Motions: any turn (about the vertical axis), shifts as far as two scan radii.
+and the pose graph and the refinement are solved again; in the plane also those of a point-to-line ICP. ``scattered``:
+between scans drawn at random, each with a motion of its own. ``agreeing``: in groups of four between neighbouring
+scans, all of a group leading to the same wrong place along the chain, as rooms that look alike do. A wrong loop has the
+information, centre and score of a right edge. Motions: any turn (about the vertical axis), shifts as far as two scan
+radii.
 """
 
 import argparse
@@ -18,46 +19,17 @@ import numpy as np
 import torch
 
 from bbr_layer import RigidMotion
+from benchmarks.false_loop_solvers import Ours, PointToLineGraph, Solver
 from benchmarks.kept import keep, kept_results
+from benchmarks.mapping_rivals import LINES
 from benchmarks.mapping_rows import ROWS, Row
-from benchmarks.mapping_table import map_errors
-from train.agreement import agreed_poses
-from train.config import EdgeConfig
-from train.edges import refined, register_edges
-from train.loops import DOUBTED
-from train.pose_graph import Edges, solve_pose_graph, spanning_poses
-from train.prepared import prepare, thinned
-from train.scans import ScanSet, silent
-from train.scene import build_scene
+from train.pose_graph import Edges
+from train.scans import ScanSet
 
 CHOSEN = ("v1_pose0, stride 2", "v1_pose0, noise 1 px", "v1_pose0, 180 deg", "balm 30-108, stride 1")
 SHARES, KINDS, SEEDS = (0.1, 0.3), ("scattered", "agreeing"), 5
 GROUP = 4
-
-
-class Solved(NamedTuple):
-    """The error of a map in its row's unit, and how many of the wrong loops were believed."""
-
-    error: float
-    believed: int
-
-
-class Solver:
-    """The mapper's own pose graph and refinement for the edges of one row; the scans are made ready once."""
-
-    def __init__(self, row: Row, scans: ScanSet) -> None:
-        self.row, self.scans, config = row, scans, EdgeConfig()
-        self.full = prepare(scans, config.refined_points)
-        self.scene = build_scene(scans, thinned(self.full, config.points))
-
-    def __call__(self, edges: Edges, wrong: int) -> Solved:
-        """The map of edges of which the last ``wrong`` are wrong, from the poses of the chain and the window."""
-        sure = edges.kept(edges.kind < 2)
-        begin, _ = solve_pose_graph(sure, spanning_poses(edges.kept(edges.kind == 0), len(self.scans)))
-        poses, belief = agreed_poses(self.scene, edges, (begin,))
-        found = refined(self.full, self.scene, (edges, belief), poses, silent).matrix.numpy()
-        error = map_errors(found, self.scans, self.row)[self.row.error]
-        return Solved(error, int((belief[len(belief) - wrong :] > DOUBTED).sum()))
+OURS, RIVAL = "ours", "point-to-line + graph"
 
 
 class Wrong(NamedTuple):
@@ -104,32 +76,41 @@ def _group(
     return [(i + step, j + step, to_target[step] @ wrong @ from_source[step]) for step in steps]
 
 
-def measured(row: Row) -> dict[str, list[list[float]]]:
+def measured(solver: Solver) -> dict[str, list[list[float]]]:
     """By share and kind, ``[error, wrong loops believed, wrong loops]`` of every seed; by ``"0"`` without any."""
-    scans = row.make()
-    edges, poses = register_edges(scans, EdgeConfig(), lambda *told: print("\r", *told, end="   ", flush=True))
-    reach = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in scans.points]))
-    solved = Solver(row, scans)
-    results = {"0": [[solved(edges, 0).error, 0.0, 0.0]]}
+    results = {"0": [[solver(solver.edges, 0).error, 0.0, 0.0]]}
     for share, kind, seed in product(SHARES, KINDS, range(SEEDS)):
         print(f"\r{share} {kind} {seed}", end="      ", flush=True)
-        more = wrong_loops(edges, poses, reach, Wrong(share, kind, seed))
-        found = solved(edges.joined(more), len(more.target))
+        more = wrong_loops(solver.edges, solver.poses, solver.reach, Wrong(share, kind, seed))
+        found = solver(solver.edges.joined(more), len(more.target))
         results.setdefault(f"{share} {kind}", []).append([found.error, found.believed, len(more.target)])
     return results
 
 
+def rival(row: Row, scans: ScanSet) -> PointToLineGraph:
+    """Point-to-line ICP with a graph, at the setting that is nearer to the truth without wrong loops."""
+    solvers = [PointToLineGraph(row, scans, setting, told) for setting in LINES.values()]
+    return min(solvers, key=lambda solver: solver(solver.edges, 0).error)
+
+
+def told(stage: str, done: int, total: int) -> None:
+    """Progress, in one line."""
+    print(f"\r{stage} {done}/{total}", end="   ", flush=True)
+
+
 def table(results: dict[str, dict[str, list[list[float]]]]) -> str:
-    """One row per sequence, share and kind."""
+    """One row per sequence, mapper, share and kind."""
     lines = [
         "Made by `python -m benchmarks.false_loops`: wrong loops added to the registered edges until they are the",
-        "share of all loops; the pose graph and the refinement solved again. Errors: median and",
-        f"worst of {SEEDS} seeds over the error without wrong loops; believed: wrong loops that were, of all seeds.",
+        "share of all loops; the pose graph, and of our mapper the refinement, solved again. Errors: median and",
+        f"worst of {SEEDS} seeds over the mapper's own error without wrong loops; believed: wrong loops that were, of",
+        "all seeds. The rival has its better setting, chosen with the truth, and our graph's robust solver without",
+        "the choice among its solutions.",
         "",
-        "| sequence | wrong loops | of all | error without | median | worst | believed |",
-        "|---|---|---|---|---|---|---|",
+        "| sequence | mapper | wrong loops | of all | error without | median | worst | believed |",
+        "|---|---|---|---|---|---|---|---|",
     ]
-    for name, found in results.items():
+    for (name, mapper), found in sorted(_by_mapper(results).items(), key=lambda item: CHOSEN.index(item[0][0])):
         (without, *_), unit = found["0"][0], ROWS[name].unit.name
         for key, seeds in found.items():
             if key == "0":
@@ -143,8 +124,15 @@ def table(results: dict[str, dict[str, list[list[float]]]]) -> str:
                 f"{np.median(ratios):.3f} x",
                 f"{max(ratios):.3f} x",
             )
-            lines.append(f"| {name} | {kind} | {' | '.join(cells)} | {believed} of {count} |")
+            lines.append(f"| {name} | {mapper} | {kind} | {' | '.join(cells)} | {believed} of {count} |")
     return "\n".join(lines) + "\n"
+
+
+def _by_mapper(results: dict[str, dict[str, list[list[float]]]]) -> dict[tuple[str, str], dict[str, list[list[float]]]]:
+    """Results by sequence and mapper; what has no mapper beside its name is ours."""
+    return {
+        (name, mapper or OURS): found for key, found in results.items() for name, _, mapper in [key.partition(" | ")]
+    }
 
 
 def main() -> None:
@@ -156,11 +144,16 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     results = kept_results(options.out)
-    for name in CHOSEN:
-        if not name.startswith(tuple(options.only)) or (name in results and not options.again):
-            continue
-        results[name] = measured(ROWS[name])
-        keep(results, table(results), options.out)
+    for name in (name for name in CHOSEN if name.startswith(tuple(options.only))):
+        row, scans = ROWS[name], ROWS[name].make()
+        mappers = {name: lambda row=row, scans=scans: Ours(row, scans, told)}
+        if scans.dimension == 2:
+            mappers[f"{name} | {RIVAL}"] = lambda row=row, scans=scans: rival(row, scans)
+        for key, make in mappers.items():
+            if key in results and not options.again:
+                continue
+            results[key] = measured(make())
+            keep(results, table(results), options.out)
     print("\n" + table(results))
 
 

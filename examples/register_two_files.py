@@ -5,22 +5,15 @@ python examples/register_two_files.py TARGET SOURCE MOVED
 
 import sys
 
-import torch
-
-from bbr_layer import BBRLayer, Detached, read_cloud, write_cloud
+from bbr_layer import BBRLayer, Detached, read_cloud, register, write_cloud
 
 target_file, source_file, moved_file = sys.argv[1:4]
-P, Q = (torch.from_numpy(read_cloud(path).points) for path in (target_file, source_file))
+target, source = read_cloud(target_file), read_cloud(source_file)
 
-# The soft stage compares all pairs of points: a thousand of each cloud are enough to find the motion.
-few_P, few_Q = (cloud[torch.randperm(len(cloud))[:1000]] for cloud in (P, Q))
-layer = BBRLayer(backward=Detached())  # no gradients are asked for here
-result = layer(few_P, few_Q)
-
-# F alone takes many more points, and begins where the first registration ended.
-many_P, many_Q = (cloud[torch.randperm(len(cloud))[:10_000]] for cloud in (P, Q))
-result = BBRLayer("F", backward=Detached())(many_P, many_Q, start=result.target_from_source)
+# All points, whatever the unit; the files' own normals where they have some. BBRLayer.robust() tries more turns.
+result = register(target, source, layer=BBRLayer(backward=Detached()))  # no gradients are asked for here
 
 print(result.target_from_source.matrix)
-print(f"{result.words}, with {int(result.buddies)} best buddies of {len(many_Q)} points")
-write_cloud(moved_file, result.target_from_source(Q).numpy())
+print(f"{result.words}, with {int(result.buddies)} best buddies of {len(source.points)} points")
+print(f"right with probability {float(result.confidence):.2f}; {len(result.weak_directions)} directions held by nothing")
+write_cloud(moved_file, result.target_from_source(source.points))

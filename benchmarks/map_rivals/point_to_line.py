@@ -148,11 +148,16 @@ def solved(scans: ScanSet, setting: tuple[float, bool], told: Progress) -> Solut
 
 def agreed(rival: PointToLine, motions: np.ndarray, told: Progress) -> np.ndarray:
     """Poses ``(k, 3, 3)`` in reaches of a robust pose graph."""
+    return agreed_edges(rival, motions, told)[1]
+
+
+def agreed_edges(rival: PointToLine, motions: np.ndarray, told: Progress) -> tuple[Edges, np.ndarray]:
+    """Chain, window and loops, and the poses ``(k, 3, 3)`` that they agree on; in reaches."""
     overlap, count = Overlap(rival.points, rival.tolerance), len(motions) + 1
     edges = rival.edges([(i, i + 1) for i in range(count - 1)], list(motions), FROM_POSES, overlap)
     least, poses = LOOP_SHARE * edges.score.median(), along(edges.target_from_source.matrix.numpy())
     if count > 2:
-        edges = edges.joined(_from(rival, window_pairs(count), poses, overlap))
+        edges = edges.joined(_from(rival, window_pairs(count), poses, overlap, kind=1))
     poses = _solved_graph(edges, poses)
     for turn in range(ROUNDS):
         told("rounds of loops", turn + 1, ROUNDS)
@@ -160,16 +165,22 @@ def agreed(rival: PointToLine, motions: np.ndarray, told: Progress) -> np.ndarra
         pairs = [pair for pair in loop_pairs(poses) if pair not in joined]
         if not pairs:
             break
-        loops = _from(rival, pairs, poses, overlap)
+        loops = _from(rival, pairs, poses, overlap, kind=2)
         edges = edges.joined(loops.kept(loops.score >= least))
         poses = _solved_graph(edges, poses)
-    return poses
+    return edges, poses
 
 
-def _from(rival: PointToLine, pairs: list[tuple[int, int]], poses: np.ndarray, overlap: Overlap) -> Edges:
+def _from(rival: PointToLine, pairs: list[tuple[int, int]], poses: np.ndarray, overlap: Overlap, *, kind: int) -> Edges:
     starts = [np.linalg.inv(poses[i]) @ poses[j] for i, j in pairs]
-    return rival.edges(pairs, starts, FROM_POSES, overlap)
+    found = rival.edges(pairs, starts, FROM_POSES, overlap)
+    return found._replace(kind=torch.full_like(found.kind, kind))
 
 
 def _solved_graph(edges: Edges, poses: np.ndarray) -> np.ndarray:
-    return solve_pose_graph(edges, RigidMotion.from_matrix(torch.from_numpy(poses)))[0].matrix.numpy()
+    return solve_pose_graph(edges, motions_of(poses))[0].matrix.numpy()
+
+
+def motions_of(poses: np.ndarray) -> RigidMotion:
+    """Poses ``(k, 3, 3)`` as motions."""
+    return RigidMotion.from_matrix(torch.from_numpy(poses))
