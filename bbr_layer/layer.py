@@ -18,7 +18,7 @@ from bbr_layer.starts import best_start
 from bbr_layer.temperature import Temperature
 from bbr_layer.transforms import is_transformed, registered
 
-# Measured (benchmarks/starts.md): none of 180 registrations turned by 30 to 90 degrees fails.
+# Measured (benchmarks/starts.md, planar.md): none of 180 registrations turned by 30 to 90 degrees fails.
 ROBUST_STARTS = 7
 
 
@@ -31,7 +31,8 @@ class BBRLayer(nn.Module):
         ``"softBD"``, ``"N"``, ``"F"`` for a single scale-free stage. None: the measured default, softBBS then F.
     starts: how many starting rotations are tried as one batch, 1 or more, on as few points as the first stage sees. The
         one kept ends with most buddies on each other's planes (softBBS without normals). The gradient is that of the
-        run from there; the choice has none. ``BBRLayer.robust()`` tries 7, which costs about five times as much.
+        run from there; the choice has none. ``BBRLayer.robust()`` tries 7, which costs about five times as much. None:
+        1, or with stages for the plane alone, as the default's there, 7 if no start is given (benchmarks/planar.md).
     backward: how gradients reach the inputs: ``Replay()`` (default, exact), ``Truncated(last_steps)``,
         ``Implicit()``, ``Autograd()`` (second derivatives) or ``Detached()``.
     inner, temperature: settings of the one stage that is given by name.
@@ -51,7 +52,7 @@ class BBRLayer(nn.Module):
         self,
         *stages: Stage | str,
         backward: Backward | None = None,
-        starts: int = 1,
+        starts: int | None = None,
         inner: Inner | None = None,
         temperature: Temperature | None = None,
     ):
@@ -64,10 +65,11 @@ class BBRLayer(nn.Module):
         if not named and len(given) != len(stages):
             raise ValueError("stages must all be Stage objects, or one of the paper's names alone: try BBRLayer('F')")
         chosen = [named_stage(names[0], inner, temperature)] if named else given or default_stages()
-        if chosen[0].above:
-            raise ValueError(f"the first stage has above={chosen[0].above}; smaller clouds would be left with none: 0")
+        for first in filter(None, (next((x for x in chosen if x.dimension in (None, d)), None) for d in (2, 3))):
+            if first.above:
+                raise ValueError(f"the first stage has above={first.above}; smaller clouds would be left with none: 0")
         self.stages = nn.ModuleList(chosen)
-        if not isinstance(starts, int) or starts < 1:
+        if starts is not None and (not isinstance(starts, int) or starts < 1):
             raise ValueError(f"starts is {starts}; it must be a whole number of at least 1: try 7")
         if backward is not None and not isinstance(backward, Backward):
             raise ValueError(f"backward is {backward!r}; it must be one of the modes, as an object: try Replay()")
@@ -163,9 +165,12 @@ class BBRLayer(nn.Module):
         frame, pair = prepared(given, needs_normals, self.scaled)
         motion = begun_at(start, pair, frame, self.scaled)
         stages = [stage for stage in self.sequence if stage.wanted(pair)]
+        if not stages:
+            raise ValueError(f"P is in {pair.P.shape[-1]}D, and no stage of the layer is for such: try dimension=None")
         steps = sum(stage.inner.steps for stage in stages)
-        if self.starts > 1:
-            motion, stages[0], tried = best_start(self.starts, stages, (pair, frame), motion)
+        starts = self.starts or (ROBUST_STARTS if start is None and stages[0].dimension == 2 else 1)
+        if starts > 1:
+            motion, stages[0], tried = best_start(starts, stages, (pair, frame), motion)
             if tried is not None and not differentiable:
                 return judged(pair, frame, tried, steps)
         mode = self.backward_mode if differentiable else Detached()
@@ -184,9 +189,10 @@ class BBRLayer(nn.Module):
         return any(x.requires_grad for x in (*fields, *settings, *self.parameters()))
 
     def __repr__(self) -> str:
-        stages = ", ".join(map(repr, self.stages))
-        starts = "" if self.starts == 1 else f", starts={self.starts}"
-        return f"BBRLayer({stages}, backward={self.backward_mode!r}{starts})"
+        settings = [*map(repr, self.stages), f"backward={self.backward_mode!r}"]
+        settings += [] if self.starts in (None, 1) else [f"starts={self.starts}"]
+        many = len(self.stages) > 1
+        return "\n  ".join(["BBRLayer(", *settings]) + "\n)" if many else f"BBRLayer({', '.join(settings)})"
 
 
 def _device_type(points: Tensor) -> str:

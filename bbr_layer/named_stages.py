@@ -1,6 +1,7 @@
 """The stages that people ask for by name: the measured default, one loss alone, the paper's."""
 
 from collections.abc import Callable
+from typing import TypedDict, Unpack
 
 from bbr_layer.inner.adam import Adam
 from bbr_layer.inner.charts import EulerAngles
@@ -21,6 +22,10 @@ FIRST_POINTS = 1000
 # by then. Chosen: without them a pair of bun180 and bun270 and scans of the plane are lost; larger steps or less
 # rounding show in the gradient on exact copies (tests/test_sensitivity.py).
 FIRST_STEPS, FIRST_RATE, FIRST_ROUNDING = 40, 0.01, 0.3
+# Points of each cloud that all of Adam's steps see in the plane, where they lie on curves: 64 lie there as far apart as
+# 1000 on a surface, and steps of many spacings neither find the way nor have a gradient of use. Then the iterations and
+# the rounding in point spacings with which Gauss-Newton ends on all points: benchmarks/planar.md.
+PLANAR_POINTS, PLANAR_ITERATIONS, PLANAR_ROUNDING = 64, 20, (0.3, 0.03)
 # Temperatures beyond which a pair hardly pulls in F: at the end 1.5 point spacings of Eq. 7, which adds two normals.
 # Measured: a sixth to a half less error beside a distractor, about the same on whole models; benchmarks/reach.md.
 REACH = 50.0
@@ -34,45 +39,64 @@ LAST_ITERATIONS, LAST_ROUNDING = 5, (0.1, 0.03)
 def default_stages(soft_points: int = SOFT_POINTS) -> list[Stage]:
     """Soft buddies for the basin, then hard ones on planes for the accuracy; scale-free, measured.
 
-    F begins with the paper's, which pulls from any distance; then its reach is finite. Of more than 1000 points it sees
-    as many at first; of more than 10 000 it then sees those, and all in the last five iterations, of Gauss-Newton.
+    F begins with the paper's, which pulls from any distance; then its reach is finite. In space, of more than 1000
+    points it sees as many at first; of more than 10 000 it then sees those, and all in the last five iterations, of
+    Gauss-Newton. In the plane all that sees 64 points, and Gauss-Newton ends on all.
     """
-    soft, rounding = named_stage("softBBS", points=soft_points), Annealed(FIRST_ROUNDING, FIRST_ROUNDING)
-    first = named_stage("F", Adam(FIRST_STEPS, FIRST_RATE), rounding, points=FIRST_POINTS)
-    coarse = _filter_stage(points=FIRST_POINTS, above=FIRST_POINTS)
-    return [soft, first, coarse, _filter_stage(points=FINE_POINTS), _last_stage()]
+    flat, begin = Clouds(points=min(soft_points, PLANAR_POINTS), dimension=2), Adam(FIRST_STEPS, FIRST_RATE)
+    rounding = Annealed(FIRST_ROUNDING, FIRST_ROUNDING)
+    planar = [named_stage("softBBS", **flat), named_stage("F", begin, rounding, **flat), _filter_stage(**flat)]
+    spatial = [
+        named_stage("softBBS", points=soft_points, dimension=3),
+        named_stage("F", begin, rounding, points=FIRST_POINTS, dimension=3),
+        _filter_stage(points=FIRST_POINTS, above=FIRST_POINTS, dimension=3),
+        _filter_stage(points=FINE_POINTS, dimension=3),
+    ]
+    return [*planar, _planar_last_stage(above=min(soft_points, PLANAR_POINTS)), *spatial, _spatial_last_stage()]
 
 
 def fast_stages(soft_points: int = FAST_SOFT_POINTS) -> list[Stage]:
     """The same with soft buddies of fewer points and Gauss-Newton instead of most steps."""
-    soft = named_stage("softBBS", Adam(40, 0.1), points=soft_points)
-    first = named_stage("F", GaussNewton(8), points=FIRST_POINTS)
-    return [soft, first, _filter_stage(GaussNewton(8), points=FINE_POINTS), _last_stage()]
+    flat, soft, few = Clouds(points=min(soft_points, PLANAR_POINTS), dimension=2), Adam(40, 0.1), GaussNewton(8)
+    planar = [named_stage("softBBS", soft, **flat), named_stage("F", few, **flat)]
+    spatial = [
+        named_stage("softBBS", soft, points=soft_points, dimension=3),
+        named_stage("F", few, points=FIRST_POINTS, dimension=3),
+        _filter_stage(few, points=FINE_POINTS, dimension=3),
+    ]
+    return [*planar, _planar_last_stage(), *spatial, _spatial_last_stage()]
 
 
-def _last_stage() -> Stage:
-    return _filter_stage(GaussNewton(LAST_ITERATIONS), Annealed(*LAST_ROUNDING), above=FINE_POINTS)
+def _planar_last_stage(above: int = 0) -> Stage:
+    return _filter_stage(GaussNewton(PLANAR_ITERATIONS), Annealed(*PLANAR_ROUNDING), above=above, dimension=2)
+
+
+def _spatial_last_stage() -> Stage:
+    return _filter_stage(GaussNewton(LAST_ITERATIONS), Annealed(*LAST_ROUNDING), above=FINE_POINTS, dimension=3)
+
+
+class Clouds(TypedDict, total=False):
+    """Which clouds a stage is for, and how much it sees of them: as ``Stage`` has it."""
+
+    points: int | None
+    above: int
+    dimension: int | None
 
 
 def _filter_stage(
-    inner: Inner | None = None, temperature: Temperature | None = None, *, points: int | None = None, above: int = 0
+    inner: Inner | None = None, temperature: Temperature | None = None, **clouds: Unpack[Clouds]
 ) -> Stage:
     """F by name, but of a finite reach."""
     plain = named_stage("F", inner, temperature)
-    return Stage(BuddyFilter(reach=REACH), plain.inner, plain.temperature, points=points, above=above)
+    return Stage(BuddyFilter(reach=REACH), plain.inner, plain.temperature, **clouds)
 
 
 def named_stage(
-    name: str,
-    inner: Inner | None = None,
-    temperature: Temperature | None = None,
-    *,
-    points: int | None = None,
-    above: int = 0,
+    name: str, inner: Inner | None = None, temperature: Temperature | None = None, **clouds: Unpack[Clouds]
 ) -> Stage:
     """One scale-free stage by the paper's name of its loss: ``"softBBS"``, ``"softBD"``, ``"N"`` or ``"F"``.
 
-    What is not given is the measured setting; the rest as ``Stage`` has it.
+    What is not given is the measured setting; ``clouds`` and the rest as ``Stage`` has it.
 
     Raises
     ------
@@ -82,7 +106,7 @@ def named_stage(
     _, steps, rate, start, end = _NAMED[name]
     inner = Adam(steps, rate) if inner is None else inner
     temperature = Annealed(start, end) if temperature is None else temperature
-    return Stage(loss, inner, temperature, points=points, above=above)
+    return Stage(loss, inner, temperature, **clouds)
 
 
 def named_loss(name: str) -> Loss:

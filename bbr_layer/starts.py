@@ -143,7 +143,8 @@ def _heated(stage: Stage, hot: Tensor) -> Stage:
         return stage
     own = torch.as_tensor(stage.temperature.start, dtype=torch.float64, device=hot.device)
     heats = torch.where(hot, own.clamp(min=HOT), own)
-    return Stage(stage.loss, stage.inner, Annealed(heats, stage.temperature.end), stage.chart, points=stage.points)
+    cooling = Annealed(heats, stage.temperature.end)
+    return Stage(stage.loss, stage.inner, cooling, stage.chart, points=stage.points, dimension=stage.dimension)
 
 
 def score(pair: CloudPair, motion: RigidMotion) -> Tensor:

@@ -56,7 +56,7 @@ def register_clouds(
         if len(cloud.points) <= d:
             raise ValueError(f"the {name} has {len(cloud.points)} points; in {d}D at least {d + 1} are needed")
     motion = None if start is None else RigidMotion.from_matrix(torch.as_tensor(start, dtype=torch.float64))
-    many = starts if starts is not None else ROBUST_STARTS if preset == "robust" else 1
+    many = starts if starts is not None else ROBUST_STARTS if preset == "robust" else None
     layer = BBRLayer(*_stages(loss, preset, soft_points), backward=Detached(), starts=many)
     P, Q = (torch.from_numpy(cloud.points) for cloud in (target, source))
     normals = [None if cloud.normals is None else torch.from_numpy(cloud.normals) for cloud in (target, source)]

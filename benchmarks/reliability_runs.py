@@ -46,11 +46,12 @@ def row(trial: Trial, name: str, layer: BBRLayer) -> list[str]:
     frame, pair = prepared(given, needs_normals=True, scaled=True)
     entered, seen = frame.enter(motion), judged_clouds(pair)
     shares = statistics(seen, matched(seen, entered))[0].tolist()
-    numbers = (*_errors(c, motion.item(0)), *shares, _close_share(c, motion.item(0)))
+    numbers = (*errors(c, motion.item(0)), *shares, _close_share(c, motion.item(0)))
     return [trial.group, trial.name, name, *(f"{number:.4g}" for number in numbers)]
 
 
-def _errors(c: Clouds, motion: RigidMotion) -> tuple[float, float]:
+def errors(c: Clouds, motion: RigidMotion) -> tuple[float, float]:
+    """Degrees, and how far the points lie from where they belong on average, as a share of the source's radius."""
     degrees = math.degrees(angular_error(motion.rotation, c.truth.rotation).item())
     radius = (c.Q - c.Q.mean(0)).square().sum(1).mean().sqrt()
     return degrees, ((motion(c.Q) - c.truth(c.Q)).norm(dim=1).mean() / radius).item()

@@ -93,7 +93,7 @@ def clouds(trial: Trial) -> Clouds:
     target, source, aligned = _whole(trial.source)
     P, Q, P_rows, Q_rows = _samples(trial, target, source, generator)
     placed = aligned(Q)
-    turn = _turn(trial.degrees, placed, generator)
+    turn = turned(trial.degrees, placed, generator)
     truth = turn.inverse()
     normals = None, None
     if trial.sampling == "shared":
@@ -153,14 +153,14 @@ def _samples(
 def _with_distractor(points: Tensor, generator: torch.Generator) -> Tensor:
     """A third of the points is a smaller, turned copy of the shape beside it."""
     count = len(points) // 3
-    copy = _turn(90.0, points, generator)(points)[:count]
+    copy = turned(90.0, points, generator)(points)[:count]
     radius = (points - points.mean(0)).norm(dim=1).square().mean().sqrt()
     aside = torch.randn(3, generator=generator, dtype=torch.float64)
     copy = (copy - copy.mean(0)) / 2 + points.mean(0) + 1.5 * radius * aside / aside.norm()
     return torch.cat((points[count:], copy))
 
 
-def _turn(degrees: float, points: Tensor, generator: torch.Generator) -> RigidMotion:
+def turned(degrees: float, points: Tensor, generator: torch.Generator) -> RigidMotion:
     """A turn about the centroid and a shift by up to a tenth of the radius."""
     d, centre = points.shape[1], points.mean(0)
     axis = torch.randn(1 if d == 2 else 3, generator=generator, dtype=torch.float64)

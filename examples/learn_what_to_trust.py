@@ -58,5 +58,7 @@ for step in range(steps):
     loss.backward()
     optimiser.step()
     if step % 5 == 0 or step == steps - 1:
-        dark, bright = trust(torch.tensor([[0.3], [0.7]])).flatten().tolist()
-        print(f"step {step}: {loss.item():.4f} aside, weight {dark:.2f} where nothing moved, {bright:.2f} where it did")
+        still, moved = trust(torch.tensor([[0.3], [0.7]])).flatten().tolist()
+        print(
+            f"step {step}: {loss.item():.4f} aside; a point that moved counts {moved / still:.2f} of one that did not"
+        )

@@ -15,5 +15,5 @@ result = register(target, source, layer=BBRLayer(backward=Detached()))  # no gra
 
 print(result.target_from_source.matrix)
 print(f"{result.words}, with {int(result.buddies)} best buddies of {len(source.points)} points")
-print(f"right with probability {float(result.confidence):.2f}; {len(result.weak_directions)} directions held by nothing")
+print(f"right with probability {float(result.confidence):.2f}, directions that nothing holds: {result.weak_directions}")
 write_cloud(moved_file, result.target_from_source(source.points))

@@ -1,5 +1,6 @@
 """Every script in examples/ runs on generated data, as a reader would run it, and does what it says."""
 
+import re
 import runpy
 import sys
 from collections.abc import Callable
@@ -30,8 +31,34 @@ def two_files(folder: Path) -> tuple[list[str], Callable[[str], None]]:
     return [str(folder / f"{name}.ply") for name in ("target", "source", "moved")], check
 
 
+def nothing_needed(folder: Path) -> tuple[list[str], Callable[[str], None]]:
+    """No arguments for instead_of_chamfer.py; best buddies end a hundred times nearer."""
+
+    def check(printed: str) -> None:
+        chamfer, buddies = (float(aside) for aside in re.findall(r"degrees, ([\d.]+) aside", printed))
+        assert buddies < 0.01 and chamfer > 100 * buddies
+
+    return [], check
+
+
+def few_steps(folder: Path) -> tuple[list[str], Callable[[str], None]]:
+    """How many steps learn_what_to_trust.py takes; by then it ends a tenth as far off, and trusts the right points."""
+
+    def check(printed: str) -> None:
+        asides = [float(aside) for aside in re.findall(r": ([\d.]+) aside", printed)]
+        shares = [float(share) for share in re.findall(r"counts ([\d.]+) of one that did not", printed)]
+        assert asides[-1] < 0.1 * asides[0]
+        assert shares[0] > 0.8 and shares[-1] < 0.6
+
+    return ["16"], check
+
+
 # Each example with what prepares its arguments and checks its results; a new example needs a row.
-PREPARED = {"register_two_files.py": two_files}
+PREPARED = {
+    "register_two_files.py": two_files,
+    "instead_of_chamfer.py": nothing_needed,
+    "learn_what_to_trust.py": few_steps,
+}
 
 
 def test_every_example_is_run_here():

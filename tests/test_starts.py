@@ -4,12 +4,12 @@ import math
 
 import pytest
 import torch
-from problems import bumpy
+from problems import bumpy, motion
 
 from bbr_layer import BBRLayer, CloudPair, Detached, RigidMotion, Stage, angular_error, hard_buddies
 from bbr_layer.inner.adam import Adam
 from bbr_layer.losses import BuddyFilter
-from bbr_layer.named_stages import named_stage
+from bbr_layer.named_stages import default_stages, named_stage
 from bbr_layer.preparation import prepared
 from bbr_layer.starts import HOT, TURN, best_start, most_starts, score, turns
 from benchmarks.paper_experiments import EXPERIMENTS
@@ -32,7 +32,7 @@ def _error(result, truth):
 @pytest.mark.parametrize(("d", "degrees", "seed"), [(3, 90, 1), (3, 90, 8), (2, 100, 0)])
 def test_several_starts_find_what_one_misses(d, degrees, seed):
     P, Q, truth = _turned(d, degrees, seed)
-    assert _error(BBRLayer(backward=Detached())(P, Q), truth) > 20
+    assert _error(BBRLayer(backward=Detached(), starts=1)(P, Q), truth) > 20
     assert _error(BBRLayer.robust(Detached())(P, Q), truth) < 1
 
 
@@ -188,3 +188,14 @@ def test_planar_scans_that_half_a_turn_fits_nearly_as_well(real_data):
     given = clouds(trial)
     result = BBRLayer.robust(Detached())(given.P, given.Q, P_normals=given.P_normals, Q_normals=given.Q_normals)
     assert _error(result, given.truth) < 0.1
+
+
+def test_the_default_tries_several_starts_in_the_plane_alone_and_only_where_none_is_given():
+    P = bumpy(150, 2)
+    Q = motion(2, math.radians(110)).inverse()(P) + 0.005 * torch.randn_like(P)
+    wanted = motion(2, math.radians(110)).rotation
+    for layer in (BBRLayer(), BBRLayer.fast(), BBRLayer(*default_stages())):
+        assert angular_error(layer(P, Q).target_from_source.rotation, wanted) < 0.05
+    away = RigidMotion.identity(2)
+    for alone in (BBRLayer(starts=1)(P, Q), BBRLayer()(P, Q, start=away)):
+        assert angular_error(alone.target_from_source.rotation, wanted) > 0.5

@@ -78,7 +78,7 @@ def test_a_large_pair_goes_through_all_stages_and_a_small_one_leaves_the_last_ou
 
 @pytest.mark.parametrize("layer", [BBRLayer(backward=Detached()), BBRLayer.fast(Detached())], ids=["default", "fast"])
 def test_f_begins_as_the_papers_on_at_most_1000_points_and_goes_on_with_a_reach(layer):
-    stages = layer.sequence
+    stages = [stage for stage in layer.sequence if stage.dimension == 3]
     truth, P = motion(3, 0.05, 0.01), bumpy(1010, 3)
     for count in (1000, 1010):
         result = layer(P[:count], truth.inverse()(P[:count]))
@@ -87,6 +87,29 @@ def test_f_begins_as_the_papers_on_at_most_1000_points_and_goes_on_with_a_reach(
     assert (stages[1].points, stages[1].above, stages[1].loss.reach) == (1000, 0, math.inf)
     assert all(stage.loss.reach == REACH for stage in stages[2:])
     assert {stage.above for stage in stages[2:-1]} <= {0, 1000} and stages[-1].points is None
+
+
+@pytest.mark.parametrize("layer", [BBRLayer(backward=Detached()), BBRLayer.fast(Detached())], ids=["default", "fast"])
+def test_in_the_plane_few_points_show_the_way_and_all_decide(layer, monkeypatch):
+    seen = []
+    forward = Stage.forward
+
+    def spy(stage, pair, *rest, **named):
+        seen.append((stage.dimension, type(stage.inner), thinned_pair(pair, stage.points).P.shape[1]))
+        return forward(stage, pair, *rest, **named)
+
+    monkeypatch.setattr(Stage, "forward", spy)
+    truth, P = motion(2, 0.3, 0.05), bumpy(500, 2)
+    result = layer(P, truth.inverse()(P))
+    assert angular_error(result.target_from_source.rotation, truth.rotation) < 1e-6
+    assert {dimension for dimension, _, _ in seen} == {2}
+    assert all(points <= 64 for _, _, points in seen[:-1]) and seen[-1] == (2, GaussNewton, 500)
+
+
+def test_a_stage_is_left_out_for_clouds_of_another_dimension():
+    layer = BBRLayer(Stage(BuddyFilter(), Adam(3), dimension=2), Stage(BuddyFilter(), Adam(5), dimension=3))
+    for d, steps in ((2, 3), (3, 5)):
+        assert layer(bumpy(50, d), bumpy(50, d)).iterations.item() == steps
 
 
 def test_settings_of_a_stage_that_cannot_work_are_refused(as_a_user):
@@ -104,3 +127,9 @@ def test_settings_of_a_stage_that_cannot_work_are_refused(as_a_user):
         Stage(BuddyFilter(), points=3)
     with pytest.raises(ValueError, match="the first stage has above=10"):
         BBRLayer(Stage(BuddyFilter(), above=10))
+    with pytest.raises(ValueError, match="the first stage has above=10"):
+        BBRLayer(Stage(BuddyFilter(), dimension=2), Stage(BuddyFilter(), above=10, dimension=3))
+    with pytest.raises(ValueError, match="dimension is 4; a stage is for clouds in 2 or 3 dimensions"):
+        Stage(BuddyFilter(), dimension=4)
+    with pytest.raises(ValueError, match="P is in 2D, and no stage of the layer is for such"):
+        BBRLayer(Stage(BuddyFilter(), dimension=3))(torch.rand(9, 2), torch.rand(9, 2))
