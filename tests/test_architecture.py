@@ -46,7 +46,7 @@ ORDER = {
         inner.adam inner.pose_gradient inner.gauss_newton
         inner.squares_step
         inner.unroll
-        inner.compiled_scene inner.matched_scene inner.walk
+        inner.compiled_scene inner.matched_scene inner.walk inner.squares_walk
         inner.run inner.implicit
         backward transforms preparation
         stage

@@ -8,11 +8,12 @@ from bbr_layer import Adam, Annealed, Autograd, BBRLayer, Detached, GaussNewton,
 from bbr_layer.inner.schedules import Constant
 from bbr_layer.inner.unroll import value
 
-STEPS, TAIL = 20, 18
+STEPS, TAIL = 10, 9
 
 
 def _layer(name, steps, backward):
-    inner = Adam(steps, 0.01, schedule=Constant())
+    name, *solver = name.split(", ")
+    inner = GaussNewton(steps, damping=3.0) if solver else Adam(steps, 0.01, schedule=Constant())
     return BBRLayer(name, inner=inner, temperature=Annealed(1.0, 1.0), backward=backward)
 
 
@@ -25,7 +26,7 @@ def _pair():
 @pytest.mark.parametrize(
     "backward", [Replay(), Truncated(1), Truncated(2), Truncated(5), Autograd(), Detached()], ids=repr
 )
-@pytest.mark.parametrize("name", ["softBBS", "F"])
+@pytest.mark.parametrize("name", ["softBBS", "F", "F, Gauss-Newton"])
 def test_what_is_compared_is_the_pose_a_tenth_of_the_steps_before_the_end(name, backward, monkeypatch):
     P, Q = _pair()
     Q.requires_grad_(not isinstance(backward, Detached))

@@ -11,12 +11,14 @@ from torch import Tensor
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam, Moments
 from bbr_layer.inner.charts import RotationVector, State
+from bbr_layer.inner.gauss_newton import GaussNewton
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.unroll import Problem, Progress, begin, detached, floor, share_done, step
 from bbr_layer.kernels import scene as kernel_scene
 from bbr_layer.kernels.choice import backend, sweeps_for
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.soft import SoftKernel
+from bbr_layer.kernels.squares import MatchedSquares
 from bbr_layer.pair import CloudPair
 from bbr_layer.rotations import rotation_dimensions
 
@@ -61,6 +63,8 @@ def _advance(problem: Problem, at: Progress, until: tuple[int, int], differentia
     (last, seen), look = until, _look(problem)
     if look is not None:
         return _walked(problem, look, at, until)
+    if _solves_in_numpy(problem):
+        return _solved(problem, at, until)
     state = detached(at.state)
     for number in range(at.moments.step, last):
         if number == seen:
@@ -98,17 +102,45 @@ def _walked(
     loss, inner, done, d = problem.loss, problem.inner, at.moments.step, at.state.translation.shape[-1]
     assert isinstance(loss, PairKernel) and isinstance(inner, Adam)
     last, seen = until
-    numbers = range(done, last)
-    shares = problem.unit.new_tensor([share_done(number, inner.steps) for number in numbers])[:, None]
-    temperatures = torch.maximum(problem.temperature.at(shares, problem.unit), floor(problem))
-    temperatures = temperatures.expand(len(numbers), -1)  # Unrounded is one row for all
-    rates = inner.rates((rotation_dimensions(d), d), at.moments.first, numbers)
+    temperatures = _temperatures(problem, range(done, last))
+    rates = inner.rates((rotation_dimensions(d), d), at.moments.first, range(done, last))
     begun = (*at.state, at.moments.first, at.moments.second)
     end = walk(Steps(look, inner, done, seen), (loss.pair, loss.rounding), begun, temperatures, rates)
     moments = Moments(end.first, end.second, last)
     state = State(end.rotation, end.translation)
     at = at._replace(state=state, temperature=temperatures[-1], moments=moments, gradient_norm=end.gradient_norm)
     return at, State(end.seen_rotation, end.seen_translation)
+
+
+def _solves_in_numpy(problem: Problem) -> bool:
+    """Whether Gauss-Newton needs no tensors between its steps."""
+    squares = problem.squares
+    if squares is None or squares.stored or not isinstance(squares.squares, MatchedSquares):
+        return False
+    return squares.pair.P.device.type == "cpu" and backend("cpu").name == "numba"
+
+
+def _solved(problem: Problem, at: Progress, until: tuple[int, int]) -> tuple[Progress, State]:
+    from bbr_layer.inner.squares_walk import Steps, walk
+
+    inner, done, (last, seen) = problem.inner, at.moments.step, until
+    assert isinstance(inner, GaussNewton) and problem.squares is not None
+    temperatures = _temperatures(problem, range(done, last))
+    end = walk(Steps(problem.squares, inner.damping, seen - done), at.state, temperatures)
+    at = at._replace(
+        state=State(end.rotation, end.translation),
+        temperature=temperatures[-1],
+        moments=at.moments._replace(step=last),
+        gradient_norm=end.slope_norm,
+    )
+    return at, State(end.seen_rotation, end.seen_translation)
+
+
+def _temperatures(problem: Problem, numbers: range) -> Tensor:
+    """Of steps of these numbers, ``(steps, batch)``."""
+    shares = problem.unit.new_tensor([share_done(number, problem.inner.steps) for number in numbers])[:, None]
+    temperatures = torch.maximum(problem.temperature.at(shares, problem.unit), floor(problem))
+    return temperatures.expand(len(numbers), -1)  # Unrounded is one row for all
 
 
 def _fixed(state: State, problem: Problem, cut: Problem) -> State:
