@@ -84,7 +84,7 @@ class BBRLayer(nn.Module):
 
     @staticmethod
     def fast(backward: Backward | None = None) -> "BBRLayer":
-        """Soft buddies of few points, then a few steps of Gauss-Newton: two thirds of the default's time.
+        """Soft buddies of few points, then a few steps of Gauss-Newton: six tenths of the default's time.
 
         As accurate, but more of the turns by 60 degrees fail (benchmarks/solvers.md).
         """

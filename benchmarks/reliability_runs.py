@@ -1,4 +1,4 @@
-"""Registers every trial with the default and the robust layer and keeps what its pairs show: a table, resumable.
+"""Registers every trial with one start and with several and keeps what its pairs show: a table, resumable.
 
     python -m benchmarks.reliability_runs --seeds 4 --out benchmarks/reliability.csv
 
@@ -73,10 +73,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("benchmarks/reliability.csv"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    layers = {"default": BBRLayer(backward=Detached()), "robust": BBRLayer.robust(Detached())}
+    default, robust = BBRLayer(backward=Detached()), BBRLayer.robust(Detached())
+    in_space = {"default": default, "robust": robust}
+    in_plane = {"default": default, "one start": BBRLayer(backward=Detached(), starts=1)}  # where the default has seven
     rows = read(options.out)
     for number, trial in enumerate(trials(options.seeds)):
-        for name, layer in layers.items():
+        for name, layer in (in_plane if trial.group == "2D" else in_space).items():
             if (trial.name, name) not in rows:
                 rows[trial.name, name] = row(trial, name, layer)
         if number % EVERY == 0:
