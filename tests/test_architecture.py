@@ -91,7 +91,7 @@ ORDER = {
         pair_registration outputs
         chain
         recognition given_motion loops
-        agreement
+        agreement usual_speed
         edges
         known_edges
         groups schedule

@@ -18,6 +18,7 @@ from train.refinement import refine
 from train.scans import Progress, ScanSet, silent
 from train.scene import Scene, build_scene
 from train.surfaces import surfaces
+from train.usual_speed import at_usual_speed
 
 # Of up to so many scans in space all pairs are sought by features when their chain is broken: they came in any order.
 FEW_SCANS = 20
@@ -52,7 +53,11 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
 
 def _window(scene: Scene, scans: ScanSet, config: EdgeConfig, progress: Progress) -> Graph:
     """Each scan with those up to ``window`` later, and loops that need no poses where the chain is poor."""
-    chain = edges = consecutive(scene, scans, progress)
+    chain = consecutive(scene, scans, progress)
+    replaced = torch.zeros(len(chain.target), dtype=torch.bool)
+    if scans.dimension == 2 and scans.start is None:
+        chain, replaced = at_usual_speed(scene, chain, progress)
+    edges = chain
     broken = bool((chain.score < POOR * chain.score.median()).any())
     if scans.start is not None:
         edges = with_given(chain, scans, scene.spacing)
@@ -61,15 +66,27 @@ def _window(scene: Scene, scans: ScanSet, config: EdgeConfig, progress: Progress
     poses, belief = solve_pose_graph(edges, _anchored(spanning_poses(edges, len(scans)), scans))
     pairs = [(i, i + step) for step in range(2, config.window + 1) for i in range(len(scans) - step)]
     if pairs:
-        target, source = torch.tensor(pairs).unbind(1)
-        start = poses.between(target, source)
-        found = register_pairs(scene, (target, source), start, 1, progress)
+        found = _registered(scene, pairs, poses, replaced, progress)
         edges = edges.joined(found if scans.start is None else clear(found, chain))
         poses, belief = solve_pose_graph(edges, poses)
     if scans.dimension == 2 and broken and scans.start is None and config.loops_per_scan:
         edges = edges.joined(recognised(scene, edges, poses, apart_in_time(config), progress))
         poses, belief = solve_pose_graph(edges, poses)
     return edges, poses, belief
+
+
+def _registered(
+    scene: Scene, pairs: list[tuple[int, int]], poses: RigidMotion, replaced: Tensor, progress: Progress
+) -> Edges:
+    """The pairs of the window, registered from the poses; with a finite reach across a step that was ``replaced``."""
+    target, source = torch.tensor(pairs).unbind(1)
+    doubtful = torch.tensor([bool(replaced[i:j].any()) for i, j in pairs])
+    found = []
+    for rows, far in ((torch.nonzero(~doubtful)[:, 0], True), (torch.nonzero(doubtful)[:, 0], False)):
+        if len(rows):
+            ends = target[rows], source[rows]
+            found.append(register_pairs(scene, ends, poses.between(*ends), 1, progress, far=far))
+    return found[0] if len(found) == 1 else found[0].joined(found[1])
 
 
 def _closed(scene: Scene, graph: Graph, config: EdgeConfig, progress: Progress) -> Graph:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbr_layer import Adam, BBRLayer, Detached, RigidMotion
+from bbr_layer import Adam, Annealed, BBRLayer, BuddyFilter, Detached, RigidMotion, Stage
 from train.consensus import consensus
 from train.pose_graph import Edges
 from train.scans import Progress, silent
@@ -16,6 +16,9 @@ BATCH = 32
 # F's steps and first rate, twice the layer's own. With half as many for window and loops the narrow view of
 # benchmarks/mapping_table.md ends 3.3 px off instead of below 1.
 EDGE_STEPS, EDGE_RATE = 200, 0.01
+# Of edges that begin near: reach in temperatures, first rate, and rounding in point spacings, as the default
+# layer's F has them.
+NEAR_REACH, NEAR_RATE, NEAR_ROUNDING = 50.0, 0.005, (0.3, 0.03)
 # Points of a scan that soft buddies, whose cost grows with their square, are given.
 SOFT_POINTS = 400
 # Matches of features that are asked for a common motion, within this many spacings, and motions tried.
@@ -36,14 +39,16 @@ def register_pairs(
     progress: Progress = silent,
     *,
     weights: PointWeights = None,
+    far: bool = True,
 ) -> Edges:
     """Register scan ``source[e]`` onto scan ``target[e]`` of ``pairs = (target, source)`` for every e, in batches.
 
-    By F alone, which holds on where the start is near and does not slide along corridors.
+    By F alone, which holds on where the start is near and does not slide along corridors. Unless ``far``, with pairs of
+    a finite reach: for starts within a few point spacings, among things that moved.
     """
     target, source = pairs
     prepared = scene.prepared
-    layer = BBRLayer("F", inner=Adam(EDGE_STEPS, EDGE_RATE), backward=Detached())
+    layer = _layer(far)
     results = []
     for begin in range(0, len(target), BATCH):
         progress(STAGE_NAMES[kind], begin, len(target))
@@ -69,6 +74,13 @@ def register_pairs(
     information = torch.cat([r.information for r in results]) / buddies.clamp(min=1)[:, None, None]
     score = scores(scene, pairs, motion)
     return Edges(target, source, motion, information, centre, score, torch.full_like(target, kind))
+
+
+def _layer(far: bool) -> BBRLayer:
+    if far:
+        return BBRLayer("F", inner=Adam(EDGE_STEPS, EDGE_RATE), backward=Detached())
+    loss, inner, cooling = BuddyFilter(reach=NEAR_REACH), Adam(EDGE_STEPS, NEAR_RATE), Annealed(*NEAR_ROUNDING)
+    return BBRLayer(Stage(loss, inner, cooling), backward=Detached())
 
 
 def by_features(scene: Scene, pairs: tuple[Tensor, Tensor], kind: int, progress: Progress = silent) -> Edges:

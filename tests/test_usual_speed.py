@@ -1,0 +1,161 @@
+"""Things that go along with the sensor hide that it moves; its usual speed tells."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from small_worlds import small_world, true_edges, true_poses
+
+from bbr_layer import RigidMotion
+from train.chain import consecutive
+from train.config import EdgeConfig
+from train.edges import register_edges
+from train.prepared import prepare, thinned
+from train.scans import ScanSet, silent
+from train.scene import build_scene
+from train.usual_speed import DIRECTIONS, at_usual_speed
+
+# A corridor along x with a cupboard every few metres, that reach so far to its middle, metres; steps of the sensor,
+# rays of a scan.
+WIDTH, EVERY, DEEP, STEP, RAYS, SIGHT = 3.0, 2.5, 0.7, 0.4, 240, 9.0
+COMPANY = range(9, 12)  # the steps during which others go along
+COMPANIONS = ((1.2, 0.6), (1.5, -0.7), (-1.3, 0.6), (-1.0, -0.8))  # where, seen from the sensor
+
+
+def _walls() -> np.ndarray:
+    """Segments ``(n, 2, 2)``: both walls, and cupboards along them at irregular places."""
+    rng, segments = np.random.default_rng(0), []
+    for side in (-WIDTH / 2, WIDTH / 2):
+        segments.append([(-12, side), (40, side)])
+        for x in np.arange(-10, 40, EVERY):
+            left, inward = x + rng.uniform(0, EVERY / 2), side * DEEP
+            right = left + rng.uniform(0.3, 0.8)
+            corners = [(left, side), (left, inward), (right, inward), (right, side)]
+            segments += [corners[k : k + 2] for k in range(3)]
+    return np.array(segments, dtype=float)
+
+
+def _company() -> np.ndarray:
+    """People around the sensor, in its own frame: boxes that hide part of the view."""
+    boxes = []
+    for x, y in COMPANIONS:
+        corners = [(x + dx, y + dy) for dx, dy in ((-0.2, -0.15), (0.2, -0.15), (0.2, 0.15), (-0.2, 0.15))]
+        boxes += [[corners[k], corners[(k + 1) % 4]] for k in range(4)]
+    return np.array(boxes, dtype=float)
+
+
+def _hits(segments: np.ndarray) -> np.ndarray:
+    """Where rays from the origin first meet a segment, those within sight."""
+    angles = np.arange(RAYS) * 2 * np.pi / RAYS + 1e-3
+    rays = np.stack((np.cos(angles), np.sin(angles)), 1)[:, None]
+    start, along = segments[None, :, 0], (segments[:, 1] - segments[:, 0])[None]
+    across = rays[..., 0] * along[..., 1] - rays[..., 1] * along[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = (start[..., 0] * along[..., 1] - start[..., 1] * along[..., 0]) / across
+        share = (start[..., 0] * rays[..., 1] - start[..., 1] * rays[..., 0]) / across
+    far = np.where((far > 0) & (share >= 0) & (share <= 1), far, np.inf).min(axis=1)
+    return (rays[:, 0] * far[:, None])[far < SIGHT]
+
+
+def _walk(steps: list[float], company: range = range(0)) -> ScanSet:
+    """Scans at the ends of the steps along the corridor."""
+    places = np.concatenate(([0.0], np.cumsum(steps)))
+    clouds = []
+    for number, x in enumerate(places):
+        seen = _walls() - np.array([x, 0.1])
+        if number in company or number - 1 in company:
+            seen = np.concatenate((seen, _company()))
+        clouds.append(_hits(seen))
+    truth = np.tile(np.eye(3), (len(places), 1, 1))
+    truth[:, 0, 2] = places
+    return ScanSet(clouds, [str(k) for k in range(len(places))], np.arange(len(places), dtype=float), truth=truth)
+
+
+def _steps(count: int) -> list[float]:
+    return (STEP + 0.02 * np.random.default_rng(1).standard_normal(count)).tolist()
+
+
+def _chained(scans: ScanSet):
+    scene = build_scene(scans, thinned(prepare(scans, 5000), EdgeConfig().points))
+    chain = consecutive(scene, scans, silent)
+    return chain, *at_usual_speed(scene, chain)
+
+
+def _lengths(edges) -> np.ndarray:
+    return edges.target_from_source.translation.norm(dim=-1).numpy()
+
+
+def test_steps_that_company_hides_are_found_by_their_length():
+    steps = _steps(20)
+    chain, found, replaced = _chained(_walk(steps, COMPANY))
+    hidden = np.abs(_lengths(chain) - steps) > 0.2
+    assert hidden.any(), "the company must hide some step, or nothing is shown"
+    assert set(np.flatnonzero(hidden)) <= set(np.flatnonzero(replaced.numpy()))
+    assert np.abs(found.target_from_source.translation[:, 0].numpy() - steps).max() < 0.1
+    assert torch.equal(found.target_from_source.translation[~replaced], chain.target_from_source.translation[~replaced])
+    assert found.target.tolist() == list(range(20)) and found.source.tolist() == list(range(1, 21))
+
+
+def test_the_map_is_right_though_others_go_along():
+    scans = _walk(_steps(20), COMPANY)
+    _, poses = register_edges(scans, EdgeConfig())
+    assert (poses.translation - true_poses(scans).translation).norm(dim=-1).max() < 0.02
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_sensor_that_stood_is_left_where_it_stood(noise):
+    steps, random = _steps(20), np.random.default_rng(3)
+    steps[8] = steps[9] = 0.0
+    scans = _walk(steps)
+    scans = dataclasses.replace(scans, points=[x + noise * random.standard_normal(x.shape) for x in scans.points])
+    chain, found, replaced = _chained(scans)
+    assert not replaced.any() and torch.equal(found.score, chain.score)
+    np.testing.assert_allclose(_lengths(found)[8:10], 0.0, atol=0.01)
+
+
+def test_where_every_step_is_another_there_is_no_usual_length():
+    steps = np.random.default_rng(2).uniform(0.0, 0.8, 20).tolist()
+    _, _, replaced = _chained(_walk(steps))
+    assert not replaced.any()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_few_scans_have_a_usual_speed_too(count):
+    chain, found, replaced = _chained(_walk(_steps(count)))
+    assert not replaced.any() and len(found.target) == len(chain.target) == count
+
+
+def _judged(monkeypatch, tried: dict[int, tuple[float, float, float]], own: float = 0.6):
+    """A chain of ten steps, the sixth of which stood, whose directions lead to the ``tried`` (x, y, score)."""
+    edges = true_edges(small_world())
+    chain = edges.kept(torch.zeros(10, dtype=torch.long))
+    shifts = torch.tensor([[1.0 + 0.01 * (k % 3), 0.0] for k in range(10)], dtype=torch.float64)
+    shifts[5] = 0.0
+    motion = RigidMotion(torch.eye(2, dtype=torch.float64).expand(10, 2, 2), shifts)
+    score = torch.full((10,), 0.5, dtype=torch.float64)
+    score[5] = own
+    chain = chain._replace(target_from_source=motion, score=score)
+    answers = torch.tensor([tried.get(k, (0.0, 0.0, own)) for k in range(DIRECTIONS)], dtype=torch.float64)
+    turns = torch.eye(2, dtype=torch.float64).expand(DIRECTIONS, 2, 2)
+    found = chain.kept(torch.full((DIRECTIONS,), 5))
+    found = found._replace(target_from_source=RigidMotion(turns, answers[:, :2]), score=answers[:, 2])
+    monkeypatch.setattr("train.usual_speed._in_all_directions", lambda *_: found)
+    scene = build_scene(small_world(), thinned(prepare(small_world(), 100), 100))
+    after, replaced = at_usual_speed(scene, chain)
+    assert replaced.nonzero().flatten().tolist() in ([], [5])
+    return after.target_from_source.translation[5].tolist()
+
+
+def test_of_several_answers_the_one_most_like_the_others_is_taken(monkeypatch):
+    assert _judged(monkeypatch, {3: (1.0, 0.0, 0.3)}) == [1.0, 0.0]
+    assert _judged(monkeypatch, {3: (1.0, 0.0, 0.3), 7: (1.03, 0.0, 0.31)}) == [1.0, 0.0], "the usual length"
+    assert _judged(monkeypatch, {3: (1.0, 0.0, 0.3), 7: (-1.0, 0.0, 0.4)}) == [1.0, 0.0], "not back"
+    assert _judged(monkeypatch, {3: (1.0, 0.0, 0.3), 7: (0.0, 1.0, 0.6)}) == [0.0, 1.0], "round a corner, if it fits"
+
+
+def test_nothing_is_replaced_by_what_fits_badly_or_is_unlike_too(monkeypatch):
+    assert _judged(monkeypatch, {3: (1.0, 0.0, 0.24)}) == [0.0, 0.0], "half of the others' score is 0.25"
+    assert _judged(monkeypatch, {3: (1.0, 0.0, 0.12)}, own=0.2) == [1.0, 0.0], "or half of its own"
+    assert _judged(monkeypatch, {3: (0.9, 0.0, 0.5)}) == [0.0, 0.0]
+    assert _judged(monkeypatch, {3: (1.0, 0.0, 0.5)}, own=0.95) == [0.0, 0.0], "one view"
