@@ -18,17 +18,17 @@ from train.pose_graph import Edges
 from train.scans import Progress, silent
 from train.scene import Scene
 
-# A step is unlike the others from so many deviations of their lengths on, and nothing as far off takes its place; of at
-# most this share of all steps: where more are, there is no usual length. Chosen on the rows with movers of
-# benchmarks/mapping_table.md: 5 and 8 leave more steps that slid half of their way.
-UNLIKE, MOST = 3.0, 1 / 3
+# A step is unlike the others from so many deviations of their lengths on; of at most this share of all steps: where
+# more are, there is no usual length. Chosen: from 3 on, the median among movers that hide 40 % is 0.2 px instead of
+# 1.3, but the narrow view is 0.3 px off instead of 0.1, and wrong loops do harm there.
+UNLIKE, MOST = 8.0, 1 / 3
 # Two scans that agree so far, of at most 1, are one view: the sensor stood.
 STOOD = 0.9
 # Directions of the starts.
 DIRECTIONS = 12
 # Answers slide along a corridor as far as the steps last: they count the less the farther they end from the usual
-# length, in deviations, and from the direction of the step before, radians.
-LENGTHS, TURN = 2.0, math.pi / 2
+# length, in deviations, and from the direction of the step before, radians; beyond the last so many they do not count.
+LENGTHS, TURN, FARTHEST = 2.0, math.pi / 2, 3.0
 # Nor does an answer count whose score is below this part of the chain's median and of the score it would replace: a
 # scan of a sensor that stood agrees with nothing a step away.
 FAINT = 0.5
@@ -74,14 +74,14 @@ def _in_all_directions(scene: Scene, edges: Edges, length: Tensor, progress: Pro
 
 
 def _worth(tried: Edges, usual: tuple[float, float], before: Tensor) -> Tensor:
-    """The scores, less where the motion is unlike its sequence's, ``(e,)``; 0 where it is unlike too."""
+    """The scores, less where the motion is unlike its sequence's, ``(e,)``; 0 beyond ``FARTHEST``."""
     motion, (length, deviation) = tried.target_from_source.translation, usual
     own = torch.linalg.vector_norm(motion, dim=-1)
     away = (own - length).abs() / max(deviation, 1e-300)
     cosine = (motion @ before) / (own * before.norm()).clamp(min=1e-300)
     turned = cosine.clamp(-1, 1).arccos()
     worth = tried.score * torch.exp(-(away / LENGTHS).square() / 2 - (turned / TURN).square() / 2)
-    return torch.where(away <= UNLIKE, worth, 0.0)
+    return torch.where(away <= FARTHEST, worth, 0.0)
 
 
 def _with(chain: Edges, row: int, edge: Edges) -> Edges:
