@@ -111,10 +111,10 @@ def shares_of_sensitivity(layer: BBRLayer, P: Tensor) -> Tensor:
     Q = RigidMotion.from_rotvec(turn, torch.full((2,), 0.03, dtype=torch.float64)).inverse()(P).requires_grad_()
     result = layer(P, Q)
     wanted = torch.linalg.inv(result.information).diagonal().sqrt()
-    return torch.stack([torch.autograd.grad(x, Q, retain_graph=True)[0].norm() for x in _tangent(result, Q)]) / wanted
+    return torch.stack([torch.autograd.grad(x, Q, retain_graph=True)[0].norm() for x in tangent(result, Q)]) / wanted
 
 
-def _tangent(result: Registration, Q: Tensor) -> Tensor:
+def tangent(result: Registration, Q: Tensor) -> Tensor:
     """Turn from where the answer is, and where the source's centroid goes."""
     motion, centre = result.target_from_source, Q.detach().mean(0)
     here = RigidMotion(motion.rotation @ motion.rotation.detach().mT, torch.zeros_like(motion.translation))

@@ -13,7 +13,8 @@ import torch
 from problems import bumpy
 from torch import Tensor
 
-from bbr_layer import Adam, BBRLayer, Implicit, Registration, RigidMotion
+from bbr_layer import Adam, BBRLayer, Implicit, RigidMotion
+from benchmarks.planar import tangent
 
 FACTOR = 2.0
 
@@ -24,13 +25,6 @@ def exact_copy(P: Tensor) -> Tensor:
     axis = torch.tensor([1.0] if d == 2 else [0.6, 0.0, 0.8], dtype=torch.float64)
     shift = 0.05 * P.std() * torch.ones(d, dtype=torch.float64)
     return RigidMotion.from_rotvec(math.radians(20) * axis, shift).inverse()(P)
-
-
-def tangent(result: Registration, Q: Tensor) -> Tensor:
-    """Rotation vector and translation of the source's centroid, from where the answer is."""
-    motion, centre = result.target_from_source, Q.detach().mean(0)
-    here = RigidMotion(motion.rotation @ motion.rotation.detach().mT, torch.zeros_like(motion.translation))
-    return torch.cat((here.rotvec, motion.rotation @ centre + motion.translation))
 
 
 def shares_of_sensitivity(layer: BBRLayer, P: Tensor) -> Tensor:

@@ -19,8 +19,8 @@ from train.scans import Progress, silent
 from train.scene import Scene
 
 # A step is unlike the others from so many deviations of their lengths on; of at most this share of all steps: where
-# more are, there is no usual length. Chosen: from 3 on, the median among movers that hide 40 % is 0.2 px instead of
-# 0.9, but the narrow view is 0.3 px off instead of 0.1, and wrong loops do harm there.
+# more are, there is no usual length. Chosen: from 3 on more of them are found among movers, but wrong loops bend the
+# narrow view of benchmarks/false_loops.md.
 UNLIKE, MOST = 8.0, 1 / 3
 # Two scans that agree so far, of at most 1, are one view: the sensor stood.
 STOOD = 0.9
