@@ -8,6 +8,7 @@ import torch
 from small_worlds import small_world, true_edges, true_poses
 
 from bbr_layer import RigidMotion
+from train import edges as edges_file
 from train.chain import consecutive
 from train.config import EdgeConfig
 from train.edges import register_edges
@@ -159,3 +160,19 @@ def test_nothing_is_replaced_by_what_fits_badly_or_is_unlike_too(monkeypatch):
     assert _judged(monkeypatch, {3: (1.0, 0.0, 0.12)}, own=0.2) == [1.0, 0.0], "or half of its own"
     assert _judged(monkeypatch, {3: (0.9, 0.0, 0.5)}) == [0.0, 0.0]
     assert _judged(monkeypatch, {3: (1.0, 0.0, 0.5)}, own=0.95) == [0.0, 0.0], "one view"
+
+
+def test_pairs_of_the_window_across_a_replaced_step_are_registered_with_a_finite_reach(monkeypatch):
+    known, asked = true_edges(small_world()), {}
+
+    def registered(scene, pairs, start, kind, progress, *, far):
+        asked.update({pair: far for pair in zip(*(side.tolist() for side in pairs), strict=True)})
+        return known.kept(torch.zeros(len(pairs[0]), dtype=torch.long))
+
+    monkeypatch.setattr(edges_file, "register_pairs", registered)
+    scene = build_scene(small_world(), thinned(prepare(small_world(), 100), 100))
+    replaced = torch.arange(7) == 3  # the step from scan 3 to scan 4
+    pairs = [(0, 2), (1, 3), (2, 4), (3, 5), (4, 6), (1, 4)]
+    found = edges_file._registered(scene, pairs, true_poses(small_world()), replaced, silent)
+    assert len(found.target) == len(pairs)
+    assert asked == {(0, 2): True, (1, 3): True, (2, 4): False, (3, 5): False, (4, 6): True, (1, 4): False}
