@@ -2,20 +2,27 @@
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import torch
 
 
 def side_by_side(work: Callable[[int], None], count: int) -> None:
-    """``work(0)`` to ``work(count - 1)`` on as many threads as torch is set to."""
-    threads = min(torch.get_num_threads(), count)
-    if threads <= 1:
-        for number in range(count):
+    """``work(0)`` to ``work(count - 1)`` on as many threads as torch is set to, the caller's among them."""
+    threads, numbers = min(torch.get_num_threads(), count), iter(range(count))
+
+    def share() -> None:
+        for number in numbers:  # Python's lock hands every number to one thread
             work(number)
-    else:
-        for done in _pool(threads).map(work, range(count)):
-            assert done is None
+
+    others = [_pool(threads - 1).submit(share) for _ in range(threads - 1)]
+    try:
+        share()
+    finally:
+        begun = [other for other in others if not other.cancel()]
+        wait(begun)
+    for other in begun:
+        other.result()
 
 
 def library_threads() -> int:

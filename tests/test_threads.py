@@ -69,6 +69,17 @@ def test_what_one_thread_raises_reaches_the_caller(threads):
         side_by_side(work, 5)
 
 
+def test_work_that_is_shared_out_again_does_not_wait_for_itself(threads):
+    threads(3)
+    done = torch.zeros(4, 5)
+
+    def work(number: int) -> None:
+        side_by_side(lambda inner: done[number].__setitem__(inner, 1), 5)
+
+    side_by_side(work, 4)
+    assert done.all()
+
+
 def _in_a_fork(cloud: torch.Tensor, answer: torch.Tensor) -> None:
     answer[:] = estimate_normals(cloud.clone())  # of the cloud itself everything is known
     assert library_threads() == 1

@@ -1,14 +1,16 @@
 """A pair of clouds packed once for the compiled sweeps; the whole loop is compiled, but a large item goes in parts."""
 
+import threading
+
 import numpy as np
 from torch import Tensor, ones_like
 
 from bbr_layer.kernels import cpu_course
 from bbr_layer.kernels.cpu import pack
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
-from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Sweeps, parts_of, room_to_keep, run_item
+from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Kept, Sweeps, parts_of, room_to_keep, run_item
 from bbr_layer.kernels.cpu_course import Adjoint, Cloud
-from bbr_layer.kernels.cpu_items import Loss
+from bbr_layer.kernels.cpu_items import Loss, Tables
 from bbr_layer.kernels.scene import Scene, SoftTerms
 from bbr_layer.pair import CloudPair
 from bbr_layer.trees import in_space
@@ -30,6 +32,7 @@ class CompiledScene:
         self.loss = Loss(terms.outlier, terms.mean)
         self.batch, n, m = len(pair.P), pair.P.shape[1], pair.Q.shape[1]
         self.parted = parts_of(self.batch, n, m) > 1
+        self.rooms = _Rooms()
 
     def walk(self, number: int, course: Course, trace: Trace) -> None:
         """Take item ``number`` along all steps of the course."""
@@ -73,7 +76,23 @@ class CompiledScene:
         real = np.ones(points.shape[1], dtype=bool) if self.pair.Q_mask is None else self.pair.Q_mask[number].numpy()
         tables = self.packed.item(number)
         cloud = Cloud(points, normals, real, float(self.rounding[number]))
-        return cpu_course.Scene(cloud, tables, room_to_keep(sweeps, tables), self.loss)
+        return cpu_course.Scene(cloud, tables, self._room(sweeps, tables), self.loss)
+
+    def _room(self, sweeps: Sweeps, tables: Tables) -> Kept:
+        of_thread = self.rooms.of_thread
+        if sweeps.rates not in of_thread:
+            of_thread[sweeps.rates] = room_to_keep(sweeps, tables)
+        return of_thread[sweeps.rates]
+
+
+class _Rooms(threading.local):
+    """What the sweeps keep of an item, with rates or without: one room for each thread, whatever items it works on.
+
+    Fresh memory for every item costs time, and threads wait for each other to get it.
+    """
+
+    def __init__(self) -> None:
+        self.of_thread: dict[bool, Kept] = {}
 
 
 def _channels(vectors: Tensor) -> np.ndarray:
