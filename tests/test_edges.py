@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from small_worlds import small_world, true_edges, true_poses
 
 from bbr_layer import RigidMotion, angular_error
+from train import edges as edges_file
 from train.chain import POOR, consecutive
 from train.config import EdgeConfig
-from train.edges import register_edges
+from train.edges import NEAR, register_edges
 from train.loops import DOUBTED, again
 from train.pose_graph import Edges, solve_pose_graph, spanning_poses
 from train.prepared import prepare
@@ -222,3 +224,28 @@ def test_a_loop_that_the_graph_does_not_believe_is_dropped(monkeypatch):
     assert asked == [0, 0] and not (edges.kind == 2).any()
     assert doubted == [0, 1]  # the loop, in the second round
     assert np.abs(poses.matrix.numpy() - scans.truth).max() < 0.02
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_doubted_edge_that_the_poses_nearly_agree_with_counts_in_the_refinement(monkeypatch, d):
+    asked = {}
+
+    def refine(clouds, pairs, found, weights, progress):
+        asked["trust"] = weights[0]
+        return found
+
+    monkeypatch.setattr(edges_file, "refine", refine)
+    scans = small_world(d)
+    edges, poses, full = true_edges(scans), true_poses(scans), prepare(scans, 200)
+    scene = build_scene(scans, full)
+    count, width = len(edges.target), NEAR * scene.spacing
+    shift, turn = torch.zeros(count, d, dtype=torch.float64), torch.zeros(count, d * (d - 1) // 2, dtype=torch.float64)
+    shift[1, 0], shift[2, 0], shift[4, 0] = width / 2, 4 * width, 1.0
+    turn[3, -1] = 4 * width / full.points[int(edges.source[3])].square().sum(-1).mean().sqrt()
+    turned = RigidMotion.from_rotvec(turn, shift).rotation @ edges.target_from_source.rotation
+    centre = edges.target_from_source(edges.centre[:, None])[:, 0] + shift
+    off = RigidMotion(turned, centre - (turned @ edges.centre[..., None])[..., 0])
+    belief = torch.zeros(count, dtype=torch.float64)
+    belief[4] = 0.7
+    edges_file.refined(full, scene, (edges._replace(target_from_source=off), belief), poses, silent)
+    np.testing.assert_allclose(asked["trust"], [1.0, 0.64, 0.0, 0.0, 0.7] + [1.0] * (count - 5), rtol=1e-6)

@@ -127,23 +127,40 @@ def test_a_few_scans_have_a_usual_speed_too(count):
     assert not replaced.any() and len(found.target) == len(chain.target) == count
 
 
+def _steps_of(lengths: list[float]):
+    """A chain of steps along x, of a score as people give."""
+    chain = true_edges(small_world()).kept(torch.zeros(len(lengths), dtype=torch.long))
+    shifts = torch.tensor([[length, 0.0] for length in lengths], dtype=torch.float64)
+    motion = RigidMotion(torch.eye(2, dtype=torch.float64).expand(len(lengths), 2, 2), shifts)
+    return chain._replace(target_from_source=motion, score=torch.full((len(lengths),), 0.5, dtype=torch.float64))
+
+
+def _small_scene():
+    return build_scene(small_world(), thinned(prepare(small_world(), 100), 100))
+
+
+def test_steps_that_differ_by_rounding_alone_are_not_sought_again(monkeypatch):
+    def refused(*_):
+        raise AssertionError("sought again")
+
+    monkeypatch.setattr("train.usual_speed._in_all_directions", refused)
+    chain = _steps_of([1.0] * 9 + [1.0 + 1e-9])
+    found, replaced = at_usual_speed(_small_scene(), chain)
+    assert found is chain and not replaced.any()
+    with pytest.raises(AssertionError, match="sought again"):
+        at_usual_speed(_small_scene(), _steps_of([1.0] * 9 + [0.0]))
+
+
 def _judged(monkeypatch, tried: dict[int, tuple[float, float, float]], own: float = 0.6):
     """A chain of ten steps, the sixth of which stood, whose directions lead to the ``tried`` (x, y, score)."""
-    edges = true_edges(small_world())
-    chain = edges.kept(torch.zeros(10, dtype=torch.long))
-    shifts = torch.tensor([[1.0 + 0.01 * (k % 3), 0.0] for k in range(10)], dtype=torch.float64)
-    shifts[5] = 0.0
-    motion = RigidMotion(torch.eye(2, dtype=torch.float64).expand(10, 2, 2), shifts)
-    score = torch.full((10,), 0.5, dtype=torch.float64)
-    score[5] = own
-    chain = chain._replace(target_from_source=motion, score=score)
+    chain = _steps_of([0.0 if k == 5 else 1.0 + 0.01 * (k % 3) for k in range(10)])
+    chain.score[5] = own
     answers = torch.tensor([tried.get(k, (0.0, 0.0, own)) for k in range(DIRECTIONS)], dtype=torch.float64)
     turns = torch.eye(2, dtype=torch.float64).expand(DIRECTIONS, 2, 2)
     found = chain.kept(torch.full((DIRECTIONS,), 5))
     found = found._replace(target_from_source=RigidMotion(turns, answers[:, :2]), score=answers[:, 2])
     monkeypatch.setattr("train.usual_speed._in_all_directions", lambda *_: found)
-    scene = build_scene(small_world(), thinned(prepare(small_world(), 100), 100))
-    after, replaced = at_usual_speed(scene, chain)
+    after, replaced = at_usual_speed(_small_scene(), chain)
     assert replaced.nonzero().flatten().tolist() in ([], [5])
     return after.target_from_source.translation[5].tolist()
 
@@ -170,7 +187,7 @@ def test_pairs_of_the_window_across_a_replaced_step_are_registered_with_a_finite
         return known.kept(torch.zeros(len(pairs[0]), dtype=torch.long))
 
     monkeypatch.setattr(edges_file, "register_pairs", registered)
-    scene = build_scene(small_world(), thinned(prepare(small_world(), 100), 100))
+    scene = _small_scene()
     replaced = torch.arange(7) == 3  # the step from scan 3 to scan 4
     pairs = [(0, 2), (1, 3), (2, 4), (3, 5), (4, 6), (1, 4)]
     found = edges_file._registered(scene, pairs, true_poses(small_world()), replaced, silent)

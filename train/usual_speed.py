@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer import RigidMotion
-from train.given_motion import GAUSSIAN
+from train.given_motion import GAUSSIAN, RIGHT_TO
 from train.pair_registration import register_pairs
 from train.pose_graph import Edges
 from train.scans import Progress, silent
@@ -44,7 +44,7 @@ def at_usual_speed(scene: Scene, chain: Edges, progress: Progress = silent) -> t
     """
     lengths = torch.linalg.vector_norm(chain.target_from_source.translation, dim=-1)
     usual = lengths.median()
-    deviation = GAUSSIAN * (lengths - usual).abs().median()
+    deviation = (GAUSSIAN * (lengths - usual).abs().median()).clamp(min=RIGHT_TO * scene.spacing)
     unlike = ((lengths - usual).abs() > UNLIKE * deviation) & (chain.score < STOOD)
     replaced = torch.zeros_like(unlike)
     if not unlike.any() or unlike.sum() > MOST * len(lengths):
@@ -77,7 +77,7 @@ def _worth(tried: Edges, usual: tuple[float, float], before: Tensor) -> Tensor:
     """The scores, less where the motion is unlike its sequence's, ``(e,)``; 0 beyond ``FARTHEST``."""
     motion, (length, deviation) = tried.target_from_source.translation, usual
     own = torch.linalg.vector_norm(motion, dim=-1)
-    away = (own - length).abs() / max(deviation, 1e-300)
+    away = (own - length).abs() / deviation
     cosine = (motion @ before) / (own * before.norm()).clamp(min=1e-300)
     turned = cosine.clamp(-1, 1).arccos()
     worth = tried.score * torch.exp(-(away / LENGTHS).square() / 2 - (turned / TURN).square() / 2)
