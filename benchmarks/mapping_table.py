@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from benchmarks.kept import keep, kept_results
+from benchmarks.layer import cpu_name
 from benchmarks.mapping_rows import ROWS, Row
 from train.config import EdgeConfig
 from train.edges import register_edges
@@ -62,9 +63,10 @@ def line(name: str, found: dict[str, float]) -> str:
 def table(results: dict[str, dict[str, float]]) -> str:
     """The whole table, rows in their order."""
     head = (
-        "Made by `python -m benchmarks.mapping_table`, one thread, the default configuration for every row; maps of\n"
-        "the registered edges, before any training. ATE: RMSE of the positions after rigid alignment; points: RMS\n"
-        "displacement of the scanned points; wanted: of the points for the last three rows, else of the positions.\n"
+        f"Made by `python -m benchmarks.mapping_table` on {cpu_name()}, one thread, the default configuration for\n"
+        "every row; maps of the registered edges, before any training. ATE: RMSE of the positions after rigid\n"
+        "alignment; points: RMS displacement of the scanned points; wanted: of the points for the last three rows,\n"
+        "else of the positions.\n"
     )
     titles = "| sequence | scans | ATE | points | unit | rotation, deg | wanted | | edges | seconds | CPU seconds |"
     lines = [head, titles, "|---" * 11 + "|"] + [line(name, results[name]) for name in ROWS if name in results]
