@@ -146,7 +146,9 @@ class MutualMargins:
         index = self.forth.nearest(pose)
         back = pose[0].T.copy(), -pose[0].T @ pose[1]
         if COMPILED and self.forth.kept and self.back.searched:
-            return index, self.back.champions(back, (index, self.forth.distance))[index] == np.arange(len(index))
+            from bbr_layer.kernels import cpu_mutual
+
+            return index, cpu_mutual.agreeing(index, self.back.champions(back, (index, self.forth.distance)))
         chosen = np.zeros(len(self.back.moving), dtype=bool)
         chosen[index] = True
         return index, self.back.nearest(back, chosen)[index] == np.arange(len(index))

@@ -19,6 +19,7 @@ def side_by_side(work: Callable[[int], None], count: int) -> None:
     try:
         share()
     finally:
+        list(numbers)  # after a failure nothing new is begun
         begun = [other for other in others if not other.cancel()]
         wait(begun)
     for other in begun:

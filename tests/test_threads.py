@@ -1,6 +1,8 @@
 """The same answers from any number of threads, and none waited for that a forked process does not have."""
 
 import multiprocessing
+import threading
+import time
 
 import pytest
 import torch
@@ -67,6 +69,21 @@ def test_what_one_thread_raises_reaches_the_caller(threads):
 
     with pytest.raises(ValueError, match="three"):
         side_by_side(work, 5)
+
+
+def test_after_a_failure_nothing_new_is_begun(threads):
+    threads(2)
+    done = []
+
+    def work(number: int) -> None:
+        if threading.current_thread() is threading.main_thread():
+            raise KeyboardInterrupt
+        time.sleep(0.01)
+        done.append(number)
+
+    with pytest.raises(KeyboardInterrupt):
+        side_by_side(work, 100)
+    assert len(done) < 50
 
 
 def test_work_that_is_shared_out_again_does_not_wait_for_itself(threads):
