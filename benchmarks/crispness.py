@@ -29,11 +29,6 @@ from train.scans import ScanSet
 # Radius of a neighbourhood, metres, of the rows that begin so: some distances between neighbouring points of a scan.
 # Not the kitchen and the bunny, where small_gicp takes many minutes.
 RADII = {"balm": 0.5, "kitti": 1.0, "iclnuim": 0.05, "tum": 0.03, "dragon": 0.003}
-SETTINGS = (
-    gicp.Setting(0.02, (0.5, 0.1), False),
-    gicp.Setting(0.02, (1.0, 0.3, 0.1, 0.04), True),
-    gicp.Setting(0.05, (2.0, 0.7, 0.2), False),
-)
 TRUTH, OURS = "truth", "ours"
 KINDS = {"small_gicp GICP": "GICP", "small_gicp point-to-plane": "PLANE_ICP"}
 
@@ -60,7 +55,7 @@ def measured(name: str, row: Row, radius: float) -> dict[str, dict[str, float]]:
 
     found = {TRUTH: judged(scans.truth), OURS: judged(ours)}
     for title, kind in KINDS.items():
-        solutions = chain.from_iterable(gicp.solved(scans, kind, setting, told) for setting in SETTINGS)
+        solutions = chain.from_iterable(gicp.solved(scans, kind, setting, told) for setting in gicp.SETTINGS)
         found[title] = min((judged(poses) for _, poses in solutions if np.isfinite(poses).all()), key=_entropy)
     return found
 

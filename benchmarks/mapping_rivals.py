@@ -50,12 +50,7 @@ class Rival(NamedTuple):
 
 
 def _gicp(kind: str) -> Rival:
-    chosen = (
-        gicp.Setting(0.02, (0.5, 0.1), False),
-        gicp.Setting(0.02, (1.0, 0.3, 0.1, 0.04), True),
-        gicp.Setting(0.05, (2.0, 0.7, 0.2), False),
-    )
-    words = {f"voxel {x.voxel:g}, gates {x.gates}, {_begin(x.follow)}": x for x in chosen}
+    words = {f"voxel {x.voxel:g}, gates {x.gates}, {_begin(x.follow)}": x for x in gicp.SETTINGS}
     return Rival(lambda scans, setting, told: gicp.solved(scans, kind, setting, told), {2: words, 3: words})
 
 

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from small_worlds import displaced, small_world, true_poses
 
+from benchmarks.crispness import KINDS, entropy, line, radius_of
 from train.map_entropy import PAIRS_PER_CHUNK, mean_map_entropy
 
 
@@ -70,3 +72,17 @@ def test_neighbourhoods_of_five_points_are_left_out():
 def test_bad_input_is_refused_in_words(points, radius, words):
     with pytest.raises(ValueError, match=words):
         mean_map_entropy(points, radius)
+
+
+def test_poses_off_the_truth_make_the_map_of_the_bench_less_crisp():
+    scans = small_world(3)
+    off = displaced(true_poses(scans), 0.05).matrix.numpy()
+    assert entropy(scans, scans.truth, 0.5) < entropy(scans, off, 0.5) - 0.1
+    assert radius_of("dragon scans") == 0.003 and radius_of("v1_pose0, stride 1") is None
+
+
+def test_the_least_entropy_of_a_row_is_bold():
+    found = {"truth": {"entropy": -1.0, "error": 0.0}, "ours": {"entropy": -2.0, "error": 0.01}}
+    found |= {title: {"entropy": -1.5, "error": 0.02} for title in KINDS}
+    wanted = "| tum, stride 1 | 0.03 | -1.000 | **-2.000** (0.01) | -1.500 (0.02) | -1.500 (0.02) |"
+    assert line("tum, stride 1", found) == wanted

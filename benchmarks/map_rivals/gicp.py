@@ -36,6 +36,14 @@ class Setting(NamedTuple):
     follow: bool
 
 
+# What is tried, row by row: from in place, from the last motion with wide gates, and coarse.
+SETTINGS = (
+    Setting(0.02, (0.5, 0.1), False),
+    Setting(0.02, (1.0, 0.3, 0.1, 0.04), True),
+    Setting(0.05, (2.0, 0.7, 0.2), False),
+)
+
+
 class SmallGicp:
     """Pairs of scans by ``kind``, ``GICP`` or ``PLANE_ICP``."""
 
