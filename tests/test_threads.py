@@ -8,7 +8,7 @@ import pytest
 import torch
 from problems import bumpy, motion
 
-from bbr_layer import BBRLayer, RigidMotion, estimate_normals
+from bbr_layer import Adam, BBRLayer, RigidMotion, estimate_normals
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.threads import library_threads, side_by_side
 from bbr_layer.trees import FOR_THREADS
@@ -44,6 +44,19 @@ def test_answers_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
     for count in (1, 3):
         threads(count)
         answers.append(_everything(cloud))
+    for one, other in zip(*answers, strict=True):
+        assert one.any() and torch.equal(one, other)
+
+
+def test_threads_do_not_share_what_the_sweeps_keep(threads):
+    P = torch.stack([bumpy(150, 3) for _ in range(8)])
+    P = P * torch.linspace(0.5, 2.0, 8)[:, None, None]
+    Q, answers = P.flip(1) + 0.05, []
+    for count in (1, 3):
+        threads(count)
+        given = P.clone().requires_grad_()
+        found = BBRLayer("softBD", inner=Adam(20, 0.05))(given, Q).target_from_source.matrix
+        answers.append((found.detach(), *torch.autograd.grad(found.square().sum(), given)))
     for one, other in zip(*answers, strict=True):
         assert one.any() and torch.equal(one, other)
 

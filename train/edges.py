@@ -26,8 +26,9 @@ FEW_SCANS = 20
 # While a scan still moves by more than a point spacing, loops are sought in up to so many times the rounds asked for.
 LONGEST = 4
 
-# An edge so far from the poses, in point spacings, counts a quarter in the refinement, whatever the graph made of it.
-# Chosen: 1 helps the narrow view of v1_pose0 as much but not kitti07, 0.3 helps neither.
+# Width, in point spacings, of the kernel by which an edge near the poses counts in the refinement, whatever the graph
+# made of it: in full where they agree, no more at a width's distance, where the kernel is a quarter, under DOUBTED.
+# Chosen: 1 is as good in the narrow view of v1_pose0 but worse on kitti07, 0.3 less good in the narrow view.
 NEAR = 0.5
 
 # Edges, the poses they led to, and how far each edge was believed.
