@@ -80,6 +80,10 @@ class SoftBDNormals(SoftLoss):
     align_signs: turn normals of opposite sides before adding them. Default True; the printed equation does not.
     clip: squared distances are clipped at this many standard deviations above their mean, as the authors' code
         does; None (default, the printed equation) clips nothing.
+
+    Raises
+    ------
+    ValueError: a clip that is not positive; smoothing and outlier as for ``SoftBBS``.
     """
 
     needs_normals = True
@@ -93,6 +97,8 @@ class SoftBDNormals(SoftLoss):
         clip: float | None = None,
     ):
         super().__init__(smoothing=smoothing, outlier=outlier, match="points")
+        if clip is not None and not clip > 0:
+            raise ValueError(f"clip is {clip}; it must be positive, in standard deviations, or None: try 3.0")
         self.align_signs, self.clip = align_signs, clip
 
     def extra_repr(self) -> str:

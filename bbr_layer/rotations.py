@@ -123,9 +123,14 @@ def rotation_from_euler(angles: Float[Tensor, "*batch k"]) -> Float[Tensor, "*ba
     """
     if angles.shape[-1] == 1:
         return rotation_from_rotvec(angles)
-    axes = torch.eye(3, dtype=angles.dtype, device=angles.device)
-    about_x, about_y, about_z = (rotation_from_rotvec(angles[..., i : i + 1] * axes[i]) for i in range(3))
-    return about_z @ about_y @ about_x
+    (sin_a, sin_b, sin_c), (cos_a, cos_b, cos_c) = angles.sin().unbind(-1), angles.cos().unbind(-1)
+    tilted, fallen = sin_b * sin_a, sin_b * cos_a
+    rows = [
+        torch.stack((cos_c * cos_b, cos_c * tilted - sin_c * cos_a, cos_c * fallen + sin_c * sin_a), -1),
+        torch.stack((sin_c * cos_b, sin_c * tilted + cos_c * cos_a, sin_c * fallen - cos_c * sin_a), -1),
+        torch.stack((-sin_b, cos_b * sin_a, cos_b * cos_a), -1),
+    ]
+    return torch.stack(rows, -2)
 
 
 def euler_from_rotation(rotation: Float[Tensor, "*batch d d"]) -> Float[Tensor, "*batch k"]:

@@ -13,7 +13,6 @@ import torch
 from bbr_layer import Adam, BBRLayer, Replay
 from bbr_layer.kernels import cpu
 from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, room_to_keep
-from bbr_layer.kernels.cpu_items import Loss
 from bbr_layer.kernels.cpu_math import FAST, exp_negative, wide_vectors
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 from bbr_layer.pair import CloudPair
@@ -106,7 +105,7 @@ def sweep_rows() -> list[str]:
         lengths = torch.tensor([temperature], dtype=torch.float64), torch.tensor([0.01], dtype=torch.float64)
         scene = Scene(CloudPair(P, Q, P, Q), *lengths)
         direction = Direction(torch.ones_like(Q), torch.ones_like(Q), torch.zeros(1, dtype=torch.float64))
-        tables, loss = cpu.pack(terms, scene, direction).item(0), Loss(terms.outlier, terms.mean)
+        tables, loss = cpu.pack(terms, scene, direction).item(0), cpu.loss_of(terms)
         for what, sweeps in (("gradient", GRADIENT), ("directional derivative", DUAL)):
             kept = room_to_keep(sweeps, tables)
             spent = best(partial(sweeps.whole, tables, kept, loss), 5) / 1e6 * 1e9

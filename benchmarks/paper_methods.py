@@ -10,9 +10,8 @@ from benchmarks.paper_trials import Trial
 from benchmarks.peers import PEERS, found_by
 
 VARIANTS = ("softBBS", "softBD", "F", "N")
-# The paper's variants take seconds to a minute a registration: they run only here, and at these sizes at most.
+# The paper's variants take seconds a registration: they run only here, and at these sizes at most.
 VARIANT_PLACES, VARIANT_POINTS = {("fig2", "bunny"), ("fig3", "bunny"), ("fig4", "bun000/090")}, 500
-SLOW_VARIANT, SLOWNESS = "paper N", 20  # a minute a registration: its repeats are so many times fewer
 FEATURE_POINTS = 5000  # of a lidar scan for FPFH, whose features of 30 000 points take 25 s
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from bbr_layer import atomic_write
 from benchmarks.paper_experiments import Cell, Experiment
-from benchmarks.paper_methods import SLOW_VARIANT, SLOWNESS, Method, runs_in
+from benchmarks.paper_methods import Method, runs_in
 
 CHOOSING, CHOSEN_FROM = 4, 1000  # settings are chosen on so many seeds from this one; the figures are of seeds from 0
 TURNED_ROUND = 180.0  # degrees of error of an answer that is not finite
@@ -84,8 +84,7 @@ class Bench(NamedTuple):
     def seeds(self, method: Method) -> range:
         """Of a method's registrations in each cell."""
         if method.kind == "variant":
-            fewer = SLOWNESS if method.name == SLOW_VARIANT else 1
-            return range(-(-self.variant_repeats // fewer))
+            return range(self.variant_repeats)
         return range(round(self.repeats * self.experiment.repeats))
 
     def choosing(self) -> range:

@@ -29,8 +29,8 @@ what the paper leaves open.
   The lowest median of all but the paper's variants is bold. **s** is processor seconds per registration in the last
   column's trials, normals and trees included where the method makes them.
 - **Repeats**: {repeats} per cell, {twice} in Figs. 6 and 7, {half} per lidar pair. The paper's own variants,
-  `BBRLayer.paper(...)`, take seconds to a minute each and have at most {variants} (N {slow}), in some places, shared
-  sampling only, at most 500 points; their brackets say how many. Fewer than 20 tell a basin, not a percentage.
+  `BBRLayer.paper(...)`, take seconds each and have at most {variants}, in some places, shared sampling only, at most
+  500 points; their brackets say how many.
 - **Ours**: `BBRLayer()`, `BBRLayer.fast()` and `BBRLayer.robust()` without any argument; on lidar also
   `BBRLayer("F")`, the paper's loss alone. Lidar scans are thinned to {all} points as in the paper, for FPFH + RANSAC
   to {features}.
@@ -44,7 +44,7 @@ MISSING = "-"
 
 def document(benches: list[Bench], path: Path) -> None:
     """Write everything that was run."""
-    first, slow = benches[0], next(x for x in METHODS if x.name == "paper N")
+    first = benches[0]
     head = HEAD.format(
         machine=processor(),
         repeats=first.repeats,
@@ -53,7 +53,6 @@ def document(benches: list[Bench], path: Path) -> None:
         all=LIDAR_POINTS,
         features=FEATURE_POINTS,
         variants=first.variant_repeats,
-        slow=len(first.seeds(slow)),
         chosen=CHOOSING,
         unit=LIDAR_UNIT,
     )

@@ -119,6 +119,8 @@ def test_coincident_clouds_have_finite_gradients(name):
 def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="match='features' leaves softBBS without a pose"):
         SoftBBS(match="features")
+    with pytest.raises(ValueError, match="clip is 0.0; it must be positive, in standard deviations"):
+        SoftBDNormals(clip=0.0)
     with pytest.raises(ValueError, match="smoothing is -1"):
         BuddyFilter(smoothing=-1.0)
     with pytest.raises(ValueError, match="P_features or Q_features is missing"):

@@ -6,11 +6,11 @@ import numpy as np
 from torch import Tensor, ones_like
 
 from bbr_layer.kernels import cpu_course
-from bbr_layer.kernels.cpu import pack
+from bbr_layer.kernels.cpu import loss_of, pack
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
 from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Kept, Sweeps, parts_of, room_to_keep, run_item
 from bbr_layer.kernels.cpu_course import Adjoint, Cloud
-from bbr_layer.kernels.cpu_items import Loss, Tables
+from bbr_layer.kernels.cpu_items import Tables
 from bbr_layer.kernels.scene import Scene, SoftTerms
 from bbr_layer.pair import CloudPair
 from bbr_layer.trees import in_space
@@ -29,7 +29,7 @@ class CompiledScene:
     def __init__(self, terms: SoftTerms, pair: CloudPair, rounding: Tensor):
         self.pair, self.rounding = pair, rounding.detach().double().numpy()
         self.packed = pack(terms, Scene(pair, ones_like(rounding), rounding))
-        self.loss = Loss(terms.outlier, terms.mean)
+        self.loss = loss_of(terms)
         self.batch, n, m = len(pair.P), pair.P.shape[1], pair.Q.shape[1]
         self.parted = parts_of(self.batch, n, m) > 1
         self.rooms = _Rooms()

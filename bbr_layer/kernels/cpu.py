@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Packed, room_for_sums, run_sweeps
-from bbr_layer.kernels.cpu_items import Loss
+from bbr_layer.kernels.cpu_items import Loss, Normals
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHANNELS,
@@ -33,21 +33,27 @@ SMALLEST_OUTLIER = 1e-12
 
 
 def supports(terms: SoftTerms, scene: Scene) -> bool:
-    """Whether the compiled sweeps can do it: found by distances, with an epsilon, nothing clipped."""
-    return terms.match == "points" and terms.clip is None and terms.outlier >= SMALLEST_OUTLIER
+    """Whether the compiled sweeps can do it: found by distances, with an epsilon, clipped without padding only."""
+    padded = scene.pair.P_mask is not None or scene.pair.Q_mask is not None
+    return terms.match == "points" and not (terms.clip and padded) and terms.outlier >= SMALLEST_OUTLIER
+
+
+def loss_of(terms: SoftTerms) -> Loss:
+    """The loss as the sweeps know it."""
+    return Loss(terms.outlier, terms.mean, terms.clip or 0.0)
 
 
 def gradient(terms: SoftTerms, scene: Scene) -> tuple[Tensor, Scene]:
     """As ``reference.soft_gradient``."""
     packed = pack(terms, scene)
-    losses = run_sweeps(GRADIENT, packed, Loss(terms.outlier, terms.mean))
+    losses = run_sweeps(GRADIENT, packed, loss_of(terms))
     return torch.from_numpy(losses), _unpacked(scene, packed, 0)
 
 
 def directional(terms: SoftTerms, scene: Scene, direction: Direction) -> tuple[Scene, Scene]:
     """As ``reference.soft_directional``."""
     packed = pack(terms, scene, direction)
-    run_sweeps(DUAL, packed, Loss(terms.outlier, terms.mean))
+    run_sweeps(DUAL, packed, loss_of(terms))
     gradient, rates = _unpacked(scene, packed, 0), _unpacked(scene, packed, 1)
     # The derivative by the temperature has alpha^2 below it, which changes too.
     cooling = 2 * gradient.temperature * direction.temperature / scene.temperature
@@ -61,10 +67,12 @@ def pack(terms: SoftTerms, scene: Scene, direction: Direction | None = None) -> 
     columns = _side(pair.Q, pair.Q_weights, pair.Q_mask, COLUMN_CHANNELS)
     if direction is not None:
         _put(columns, VELOCITY, direction.Q)
-    normals = None
+    normals: Normals = None
     if terms.planes:
         P_normals, Q_normals = pair.both_normals()
         normals = _normals(P_normals, pair.P_mask, 3), _normals(Q_normals, pair.Q_mask, 6)
+        if terms.clip:
+            normals += (np.zeros((len(rows), 1), dtype=rows.dtype),)
         if direction is not None and direction.Q_normals is not None:
             _put(normals[1], 3, direction.Q_normals)
     constants = np.zeros((len(rows), CONSTANTS), dtype=rows.dtype)

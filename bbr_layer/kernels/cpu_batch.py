@@ -10,12 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_clipping import settle_limit
 from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
 from bbr_layer.kernels.cpu_dual_planes import force_rates
 from bbr_layer.kernels.cpu_forces import forces
 from bbr_layer.kernels.cpu_items import (
     Both,
     Loss,
+    Normals,
     Tables,
     item_gradient,
     item_rates,
@@ -55,7 +57,7 @@ class Packed(NamedTuple):
     """A batch of ``Tables``: the same fields with the batch before them."""
 
     sides: Both
-    normals: Both | None
+    normals: Normals
     sums: Both
     shares: Both
     constants: np.ndarray
@@ -63,7 +65,7 @@ class Packed(NamedTuple):
     def item(self, b: int) -> Tables:
         """Item ``b``."""
         sides, sums, shares = ((x[0][b], x[1][b]) for x in (self.sides, self.sums, self.shares))
-        normals = None if self.normals is None else (self.normals[0][b], self.normals[1][b])
+        normals = None if self.normals is None else tuple(x[b] for x in self.normals)
         return Tables(sides, normals, sums, shares, self.constants[b])
 
 
@@ -107,6 +109,7 @@ def run_item(sweeps: Sweeps, tables: Tables, kept: Kept, loss: Loss, batch: int)
     parts = parts_of(batch, n, m)
     if parts == 1:
         return sweeps.whole(tables, kept, loss)
+    settle_limit(tables.sides, tables.normals, tables.constants, loss.clip)
     spans = [slice(n * number // parts, n * (number + 1) // parts) for number in range(parts)]
     _in_parts(sweeps.parts[0], tables, kept, spans)
     settle_denominators(tables, loss, sweeps.rates)
@@ -126,7 +129,7 @@ def _in_parts(sweep: Callable, tables: Tables, kept: Kept, spans: list[slice]) -
 
 def _part(sweep: Callable, tables: Tables, kept: Kept, cut: tuple[list[slice], np.ndarray], number: int) -> None:
     (rows, columns), normals, span = tables.sides, tables.normals, cut[0][number]
-    shown = None if normals is None else (normals[0][:, span], normals[1])
+    shown = None if normals is None else (normals[0][:, span], *normals[1:])
     out = tables.sums[0][:, span], cut[1][number]
     own = None if kept is None else tuple(table[span] for table in kept)
     sweep((rows[:, span], columns), shown, out, tables.constants, own)

@@ -29,6 +29,7 @@ from bbr_layer.kernels.cpu_pairs import (
     add_up,
     dot,
     kept_row,
+    limit_of,
     logit_rate,
     measured_rate,
     plane_square_rate,
@@ -43,6 +44,7 @@ def denominator_rates(sides, normals, out, constants, kept):  # type: ignore[no-
     wide_vectors()
     rows, columns = sides
     scales, align, cool_rate = (constants[SMOOTH], constants[COOL]), constants[ALIGN], constants[COOL_RATE]
+    limit = limit_of(normals)
     sums = np.empty((2, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -65,7 +67,7 @@ def denominator_rates(sides, normals, out, constants, kept):  # type: ignore[no-
                         squared, half_rate = dot(offset, offset), dot(offset, velocity)
                     else:
                         around = normal, (nx[j], ny[j], nz[j]), (mx[j], my[j], mz[j])
-                        squared, half_rate = plane_square_rate((offset, velocity), around, align)
+                        squared, half_rate = plane_square_rate((offset, velocity), around, align, limit)
                     e, distance, _, distance_rate = measured_rate(None, j, squared, half_rate, scales)
                     if kept is not None:
                         seen[0][j], seen[1][j], seen[2][j] = e, distance, distance_rate
@@ -91,6 +93,7 @@ def buddy_sum_rates(sides, normals, out, constants, kept):  # type: ignore[no-un
     wide_vectors()
     rows, columns = sides
     scales, align, cool_rate = (constants[SMOOTH], constants[COOL]), constants[ALIGN], constants[COOL_RATE]
+    limit = limit_of(normals)
     sums = np.empty((4, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -115,7 +118,7 @@ def buddy_sum_rates(sides, normals, out, constants, kept):  # type: ignore[no-un
                         squared, half_rate = dot(offset, offset), dot(offset, velocity)
                     else:
                         around = normal, (nx[j], ny[j], nz[j]), (mx[j], my[j], mz[j])
-                        squared, half_rate = plane_square_rate((offset, velocity), around, align)
+                        squared, half_rate = plane_square_rate((offset, velocity), around, align, limit)
                     e, distance, _, distance_rate = measured_rate(seen, j, squared, half_rate, scales)
                     buddies = share_of(e, own_inverse) * share_of(e, inverse[j])
                     change = TWO * logit_rate(distance, distance_rate, scales[1], cool_rate) - own_rate - rate[j]

@@ -23,7 +23,10 @@ from bbr_layer.kernels.cpu_pairs import (
     add_at,
     add_three,
     add_up,
+    clipped,
     dot,
+    if_free,
+    limit_of,
     logit_rate,
     measured_rate,
     plane,
@@ -35,17 +38,19 @@ from bbr_layer.kernels.cpu_pairs import (
 
 
 @compiled(forceinline=True)
-def pushes(offsets, normals, scales, others):  # type: ignore[no-untyped-def]
+def pushes(offsets, normals, scales, others, limit):  # type: ignore[no-untyped-def]
     """Of one pair (point to plane): sign, force along the normals and its rate, the two sums, and their rates.
 
     ``offsets`` are (offset, velocity), ``normals`` (row's, column's, velocity of the column's), ``scales`` (smoothing
-    squared, 1 to align signs), ``others`` (row, column, loss) of ``slope_rate``.
+    squared, 1 to align signs), ``others`` (row, column, loss) of ``slope_rate``, ``limit`` as ``limit_of``.
     """
     (offset, velocity), loss = offsets, others[2]
     sign, total, residual = plane(offset, normals[0], normals[1], scales[1])
     residual_rate = dot(velocity, total) + dot(offset, normals[2])
-    half_rate = residual * residual_rate
-    e, distance, over, distance_rate = measured_rate(None, 0, residual * residual, half_rate, (scales[0], loss[0]))
+    squared = residual * residual
+    half_rate, shown = if_free(residual * residual_rate, squared, limit), clipped(squared, limit)
+    e, distance, over, distance_rate = measured_rate(None, 0, shown, half_rate, (scales[0], loss[0]))
+    over = if_free(over, squared, limit)
     rates = logit_rate(distance, distance_rate, loss[0], loss[3]), distance_rate
     slopes = slope_rate((e, distance), rates, others[0], others[1], loss)
     factor = slopes[1] * over
@@ -92,7 +97,7 @@ def plane_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-
     """``plane_forces`` and their rates, nothing kept used: what each pair pushes, points and normals."""
     wide_vectors()
     rows, columns = sides
-    scales, loss = (constants[SMOOTH], constants[ALIGN]), loss_rates(constants)
+    scales, loss, limit = (constants[SMOOTH], constants[ALIGN]), loss_rates(constants), limit_of(normals)
     buffer = np.ones((4, min(TILE, columns.shape[1])), dtype=rows.dtype)
     sums = np.empty((12, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
@@ -113,7 +118,7 @@ def plane_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-
                     column = weight[j], inverse[j], share[j], inverse_rate[j], share_rate[j]
                     offsets = (qx[j] - px, qy[j] - py, qz[j] - pz), (vx[j], vy[j], vz[j])
                     around = normal, (nx[j], ny[j], nz[j]), (mx[j], my[j], mz[j])
-                    sign[j], push[j], push_rate[j], s, r = pushes(offsets, around, scales, (row, column, loss))
+                    sign[j], push[j], push_rate[j], s, r = pushes(offsets, around, scales, (row, column, loss), limit)
                     heat, rounding = heat + s[0], rounding + s[1]
                     heat_rate, rounding_rate = heat_rate + r[0], rounding_rate + r[1]
                 into = three(sums, 0, first, last), three(sums, COLUMN_OUT, first, last)

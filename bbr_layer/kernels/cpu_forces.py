@@ -23,8 +23,11 @@ from bbr_layer.kernels.cpu_pairs import (
     add_at,
     add_three,
     add_up,
+    clipped,
     dot,
+    if_free,
     kept_row,
+    limit_of,
     measured,
     plane,
     point_of,
@@ -78,7 +81,7 @@ def plane_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyp
     """The gradient of a point-to-plane loss: as ``point_forces``, and the derivatives by normals in channels 3 to 5."""
     wide_vectors()
     rows, columns = sides
-    scales, align = (constants[SMOOTH], constants[COOL]), constants[ALIGN]
+    scales, align, limit = (constants[SMOOTH], constants[COOL]), constants[ALIGN], limit_of(normals)
     loss = constants[COOL], constants[BY_S], constants[BY_M]
     sums = np.empty((6, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
@@ -98,9 +101,10 @@ def plane_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyp
                 for j in range(qx.size):
                     offset = qx[j] - px, qy[j] - py, qz[j] - pz
                     sign, total, residual = plane(offset, normal, (nx[j], ny[j], nz[j]), align)
-                    e, distance, over = measured(seen, j, residual * residual, scales)
+                    squared = residual * residual
+                    e, distance, over = measured(seen, j, clipped(squared, limit), scales)
                     by_logit, by_distance = slope(e, distance, row, (weight[j], inverse[j], share[j]), loss)
-                    factor = by_distance * over
+                    factor = if_free(by_distance * over, squared, limit)
                     heat += by_logit * distance
                     rounding += factor
                     x, y, z = scaled(offset, factor * residual)

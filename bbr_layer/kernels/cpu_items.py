@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_clipping import settle_limit
 from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
 from bbr_layer.kernels.cpu_dual_planes import force_rates
 from bbr_layer.kernels.cpu_forces import forces
@@ -22,13 +23,15 @@ from bbr_layer.kernels.cpu_math import (
 from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators
 
 Both = tuple[np.ndarray, np.ndarray]
+Normals = tuple[np.ndarray, ...] | None
 
 
 class Loss(NamedTuple):
-    """The epsilon of Eq. 4, and whether the loss is M / S (Eq. 6) or -S (Eq. 5)."""
+    """The epsilon of Eq. 4, whether the loss is M / S (Eq. 6) or -S (Eq. 5), and ``settle_limit``'s ``clip``."""
 
     outlier: float
     mean: bool
+    clip: float
 
 
 class Tables(NamedTuple):
@@ -37,14 +40,14 @@ class Tables(NamedTuple):
     Parameters
     ----------
     sides: ``(channels, n)`` and ``(channels, m)``, see ``cpu_math``.
-    normals: ``(3, n)`` and ``(6, m)``, or None.
+    normals: ``(3, n)`` and ``(6, m)``, and the limit ``(1,)`` of a loss that clips; or None.
     sums: float64 ``(16, n)`` and ``(12, m)``, values before rates, as ``forces`` and its kin fill them.
     shares: float64 ``(2, n)`` and ``(2, m)``: the loss per unit of weight of each point, and its rate.
     constants: ``(c,)``.
     """
 
     sides: Both
-    normals: Both | None
+    normals: Normals
     sums: Both
     shares: Both
     constants: np.ndarray
@@ -135,6 +138,7 @@ def item_gradient(tables, kept, loss):  # type: ignore[no-untyped-def]
     ``kept`` is room for what the first sweep keeps, or None.
     """
     sides, normals, sums, constants = tables.sides, tables.normals, tables.sums, tables.constants
+    settle_limit(sides, normals, constants, loss.clip)
     denominators(sides, normals, cleared(sums), constants, kept)
     settle_denominators(tables, loss, False)
     buddy_sums(sides, normals, cleared(sums), constants, kept)
@@ -147,6 +151,7 @@ def item_gradient(tables, kept, loss):  # type: ignore[no-untyped-def]
 def item_rates(tables, kept, loss):  # type: ignore[no-untyped-def]
     """The same and the rates of change of all of it."""
     sides, normals, sums, constants = tables.sides, tables.normals, tables.sums, tables.constants
+    settle_limit(sides, normals, constants, loss.clip)
     denominator_rates(sides, normals, cleared(sums), constants, kept)
     settle_denominators(tables, loss, True)
     buddy_sum_rates(sides, normals, cleared(sums), constants, kept)

@@ -124,18 +124,43 @@ def point_of(rows, i):  # type: ignore[no-untyped-def]
     return rows[0, i], rows[1, i], rows[2, i]
 
 
+def limit_of(normals: Any) -> Any:
+    """The square at which distances are clipped, kept behind the normals; None where none are."""
+    return None if normals is None or len(normals) == 2 else normals[2][0]
+
+
+@overload(limit_of, inline="always")
+def _limit_of(normals):  # type: ignore[no-untyped-def]
+    if normals == types.none or len(normals) == 2:
+        return lambda normals: None
+    return lambda normals: normals[2][0]
+
+
 @compiled(forceinline=True)
-def plane_square(offset, normals, align):  # type: ignore[no-untyped-def]
+def clipped(squared, limit):  # type: ignore[no-untyped-def]
+    """A square, at most the limit unless that is None."""
+    return squared if limit is None else min(squared, limit)
+
+
+@compiled(forceinline=True)
+def if_free(value, squared, limit):  # type: ignore[no-untyped-def]
+    """The value; 0 where the square is clipped."""
+    return value if limit is None else (value if squared < limit else ZERO)
+
+
+@compiled(forceinline=True)
+def plane_square(offset, normals, align, limit):  # type: ignore[no-untyped-def]
     """The square of Eq. 7's distance; ``normals`` are (row's, column's)."""
     _, _, residual = plane(offset, normals[0], normals[1], align)
-    return residual * residual
+    return clipped(residual * residual, limit)
 
 
 @compiled(forceinline=True)
-def plane_square_rate(motion, normals, align):  # type: ignore[no-untyped-def]
+def plane_square_rate(motion, normals, align, limit):  # type: ignore[no-untyped-def]
     """The same and half its rate; ``motion`` is (offset, velocity), ``normals`` (row's, column's, its velocity)."""
     _, total, residual = plane(motion[0], normals[0], normals[1], align)
-    return residual * residual, residual * (dot(motion[1], total) + dot(motion[0], normals[2]))
+    squared, half_rate = residual * residual, residual * (dot(motion[1], total) + dot(motion[0], normals[2]))
+    return clipped(squared, limit), if_free(half_rate, squared, limit)
 
 
 @compiled(forceinline=True)

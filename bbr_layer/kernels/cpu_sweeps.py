@@ -21,7 +21,7 @@ from bbr_layer.kernels.cpu_math import (
     share_of,
     wide_vectors,
 )
-from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, measured, plane_square, point_of, three
+from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, limit_of, measured, plane_square, point_of, three
 
 
 @compiled()
@@ -29,7 +29,7 @@ def denominators(sides, normals, out, constants, kept):  # type: ignore[no-untyp
     """Sums of exp(-D / alpha): per row into ``out[0][0]``, per column into ``out[1][0]``."""
     wide_vectors()
     rows, columns = sides
-    scales, align = (constants[SMOOTH], constants[COOL]), constants[ALIGN]
+    scales, align, limit = (constants[SMOOTH], constants[COOL]), constants[ALIGN], limit_of(normals)
     sums = np.empty((1, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -51,7 +51,7 @@ def denominators(sides, normals, out, constants, kept):  # type: ignore[no-untyp
                     if normals is None:
                         squared = dot(offset, offset)
                     else:
-                        squared = plane_square(offset, (normal, (nx[j], ny[j], nz[j])), align)
+                        squared = plane_square(offset, (normal, (nx[j], ny[j], nz[j])), align, limit)
                     e, distance, _ = measured(None, j, squared, scales)
                     if kept is not None:
                         seen[0][j], seen[1][j] = e, distance
@@ -66,7 +66,7 @@ def buddy_sums(sides, normals, out, constants, kept):  # type: ignore[no-untyped
     """Sums of buddies and of buddies times distance, weighted by the other side: channels 0 and 1 of both ``out``."""
     wide_vectors()
     rows, columns = sides
-    scales, align = (constants[SMOOTH], constants[COOL]), constants[ALIGN]
+    scales, align, limit = (constants[SMOOTH], constants[COOL]), constants[ALIGN], limit_of(normals)
     sums = np.empty((2, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -89,7 +89,7 @@ def buddy_sums(sides, normals, out, constants, kept):  # type: ignore[no-untyped
                     if normals is None:
                         squared = dot(offset, offset)
                     else:
-                        squared = plane_square(offset, (normal, (nx[j], ny[j], nz[j])), align)
+                        squared = plane_square(offset, (normal, (nx[j], ny[j], nz[j])), align, limit)
                     e, distance, _ = measured(seen, j, squared, scales)
                     buddies = share_of(e, row_inverse) * share_of(e, inverse[j])
                     row_count += buddies * weight[j]
