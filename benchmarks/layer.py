@@ -23,7 +23,7 @@ from torch import Tensor
 
 from bbr_layer import Adam, Autograd, BBRLayer, Implicit, Replay
 from bbr_layer.kernels import cpu_batch
-from benchmarks import layer_gradients, layer_rivals, layer_sweeps
+from benchmarks import layer_gradients, layer_rivals, layer_sweeps, layer_threads
 from benchmarks.layer_problems import clouds
 from benchmarks.memory import forget_peak, peak
 
@@ -137,8 +137,8 @@ def main() -> None:
         ("Speed and memory", f"T = {STEPS}, one thread, float32.", lambda: speed_rows(options.sizes, options.losses)),
         ("Memory against steps", "", memory_rows),
         ("The sweeps", layer_sweeps.PRIMITIVES_NOTE, layer_sweeps.sweep_rows),
-        ("Threads", layer_sweeps.THREADS_NOTE, layer_sweeps.thread_rows),
-        ("A training batch", "64 pairs of 512 points, softBD, 100 steps, float32.", layer_sweeps.batch_rows),
+        ("Threads", layer_threads.THREADS_NOTE, layer_threads.thread_rows),
+        ("A training batch", "64 pairs of 512 points, softBD, 100 steps, float32.", layer_threads.batch_rows),
         ("Gradients", layer_gradients.NOTE, layer_gradients.error_rows),
     ]
     command = f"python -m benchmarks.layer {' '.join(sys.argv[1:])}"

@@ -1,7 +1,5 @@
-"""How fast the compiled sweeps are: against the processor's own primitives, over threads, and over a training batch."""
+"""How fast the compiled sweeps are against the processor's own primitives."""
 
-import math
-import multiprocessing
 import time
 from collections.abc import Callable
 from functools import partial
@@ -10,7 +8,6 @@ import numba
 import numpy as np
 import torch
 
-from bbr_layer import Adam, BBRLayer, Replay
 from bbr_layer.kernels import cpu
 from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, room_to_keep
 from bbr_layer.kernels.cpu_math import FAST, exp_negative, wide_vectors
@@ -24,13 +21,8 @@ PRIMITIVES_NOTE = (
     "roots, one division, and 30 fused multiply-adds. Each sweep as a walk calls it, with room for what it keeps. "
     "Far: half of the pairs 33 to 58 temperatures apart, where float32 products fall below the smallest normal number."
 )
-THREADS_NOTE = (
-    "A batch of 8 pairs of so many points, softBD, 30 steps, forward + backward, the best mean of three in a row. "
-    "Two processes: what the machine itself gives, each with a batch of its own and nothing shared."
-)
 NUMBERS = 2048  # float32 numbers of one array of the primitives: 8 KiB
 REPEATS = 7
-LONG = 3  # calls in a row, so that a virtual machine has time to give a second thread a core of its own
 # Temperatures in radii of the sphere: of all rows but one, and the one at which most pairs are far apart.
 NEAR, FAR = 0.1, 0.03
 
@@ -110,56 +102,4 @@ def sweep_rows() -> list[str]:
             kept = room_to_keep(sweeps, tables)
             spent = best(partial(sweeps.whole, tables, kept, loss), 5) / 1e6 * 1e9
             rows.append(f"| {name}, {what} | {spent:.2f} | {spent / bound:.2f} |")
-    return rows
-
-
-def _registration(batch: int, points: int, steps: int) -> Callable[[], object]:
-    P, Q = (cloud.requires_grad_() for cloud in clouds(points, batch))
-    layer = BBRLayer("softBD", inner=Adam(steps, 0.05), backward=Replay())
-    return lambda: torch.autograd.grad(layer(P, Q).target_from_source.matrix.square().sum(), (P, Q))
-
-
-def thread_rows() -> list[str]:
-    """The same batch on one thread, on two, and in two processes."""
-    rows = ["| points | one thread, s | two threads, s | speed-up | two processes, speed-up |", "|---|---|---|---|---|"]
-    for points in (512, 1000):
-        run, spent = _registration(8, points, 30), {1: math.inf, 2: math.inf}
-        for threads in (1, 2, 1, 2):
-            torch.set_num_threads(threads)
-            spent[threads] = min(spent[threads], best(run, LONG))
-        with multiprocessing.get_context("spawn").Pool(2) as pool:
-            beside = max(pool.map(_alone, [points] * 2, chunksize=1))
-        one, two = spent.values()
-        rows.append(f"| {points} | {one:.3f} | {two:.3f} | {one / two:.2f} | {2 * one / beside:.2f} |")
-    return rows
-
-
-def _alone(points: int) -> float:
-    """Seconds of the same batch in a process of its own, long enough for another one to run beside it."""
-    torch.set_num_threads(1)
-    run = _registration(8, points, 30)
-    return sorted(best(run, LONG) for _ in range(3))[1]
-
-
-def batch_rows() -> list[str]:
-    """Pairs per second, forward and backward, on all threads."""
-    rows = ["| device | threads | seconds | pairs per second |", "|---|---|---|---|"]
-    torch.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    run = _registration(64, 512, 100)
-    begin = time.perf_counter()
-    run()
-    spent = time.perf_counter() - begin
-    rows.append(f"| CPU | {torch.get_num_threads()} | {spent:.2f} | {64 / spent:.1f} |")
-    if torch.cuda.is_available():
-        P, Q = (cloud.cuda().requires_grad_() for cloud in clouds(512, 64))
-        layer = BBRLayer("softBD", inner=Adam(100, 0.05))
-        for _ in range(2):  # the first run compiles
-            torch.cuda.synchronize()
-            begin = time.perf_counter()
-            torch.autograd.grad(layer(P, Q).target_from_source.matrix.square().sum(), (P, Q))
-            torch.cuda.synchronize()
-            spent = time.perf_counter() - begin
-        rows.append(f"| {torch.cuda.get_device_name()} | | {spent:.2f} | {64 / spent:.1f} |")
-    else:
-        rows.append("| GPU | | none here | |")
     return rows
