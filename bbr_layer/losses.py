@@ -79,11 +79,7 @@ class SoftBDNormals(SoftLoss):
     smoothing, outlier: as for ``SoftBBS``.
     align_signs: turn normals of opposite sides before adding them. Default True; the printed equation does not.
     clip: squared distances are clipped at this many standard deviations above their mean, as the authors' code
-        does; None (default, the printed equation) clips nothing.
-
-    Raises
-    ------
-    ValueError: a clip that is not positive; smoothing and outlier as for ``SoftBBS``.
+        does (``ValueError`` unless positive); None (default, the printed equation) clips nothing.
     """
 
     needs_normals = True
@@ -139,6 +135,8 @@ class BuddyFilter(Loss):
     reach: a distance d counts as ``d / (1 + d / (reach * temperature))``, so that pairs of different surfaces, which
         lie far apart, hardly pull. Default infinite, the printed equation; the layer's default has 50,
         benchmarks/reach.md.
+    alike: in the equations of ``GaussNewton`` a pair counts as its points are alike (``kernels/likeness.py``). The loss
+        stays as it is: ``Adam`` is refused. Default False; the layer's default ends with it, benchmarks/likeness.md.
 
     Raises
     ------
@@ -147,11 +145,11 @@ class BuddyFilter(Loss):
 
     needs_normals = True
 
-    def __init__(self, smoothing: float = 0.0, *, reach: float = math.inf):
+    def __init__(self, smoothing: float = 0.0, *, reach: float = math.inf, alike: bool = False):
         super().__init__(smoothing)
         if not reach > 0:
             raise ValueError(f"reach is {reach}; it is a length in temperatures and positive: try 50, or math.inf")
-        self.reach = reach
+        self.reach, self.alike = reach, alike
 
     def objective(self, pair: CloudPair) -> Objective:
         search = search_of(pair)
@@ -167,7 +165,7 @@ class BuddyFilter(Loss):
 
     def squares(self, pair: CloudPair) -> Squares:
         pair.both_normals()
-        return MatchedSquares(search_of(pair), self.reach)
+        return MatchedSquares(search_of(pair), self.reach, self.alike)
 
     def forward(self, pair: CloudPair, temperature: Float[Tensor, "batch"]) -> Float[Tensor, "batch"]:
         search = search_of(pair)
@@ -176,7 +174,8 @@ class BuddyFilter(Loss):
 
     def extra_repr(self) -> str:
         told = [f"smoothing={self.smoothing}"] if self.smoothing else []
-        return ", ".join([*told, f"reach={self.reach:g}"] if math.isfinite(self.reach) else told)
+        told += [f"reach={self.reach:g}"] if math.isfinite(self.reach) else []
+        return ", ".join(told + ["alike=True"] * self.alike)
 
     def _matched(self, pair: CloudPair, temperature: Tensor, index: Tensor, mutual: Tensor) -> Tensor:
         P_normals, Q_normals = pair.both_normals()

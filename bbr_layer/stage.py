@@ -44,12 +44,14 @@ class Stage(nn.Module):
     chart: ``RotationVector()`` (default; scale-free) or ``EulerAngles()`` (the paper's, in data units).
     points: most points of each cloud that the stage sees, spread evenly in space. Default None, all of them.
     above: the stage is left out where neither cloud has more points than this. Default 0, never.
+    upto: the stage is left out where either cloud has more points than this. Default None, never.
     dimension: 2 or 3, the stage is left out for other clouds. Default None, never.
 
     Raises
     ------
-    ValueError: ``GaussNewton`` with a learned temperature or with Euler angles; hardly any ``points``; a soft loss with
-        ``Unrounded()``; another ``loss``, ``inner``, ``temperature`` or ``dimension``.
+    ValueError: ``GaussNewton`` with a learned temperature or with Euler angles; hardly any ``points``, or ``upto`` not
+        over ``above``; a soft loss with ``Unrounded()``; ``BuddyFilter(alike=True)`` without ``GaussNewton``; another
+        ``loss``, ``inner``, ``temperature`` or ``dimension``.
     """
 
     def __init__(
@@ -61,16 +63,17 @@ class Stage(nn.Module):
         *,
         points: int | None = None,
         above: int = 0,
+        upto: int | None = None,
         dimension: int | None = None,
     ):
         super().__init__()
         _check(loss, inner, temperature)
-        _check_clouds(points, above, dimension)
+        _check_clouds(points, (above, upto), dimension)
         self.loss = loss
         self.inner = Adam() if inner is None else inner
         self.temperature = Annealed() if temperature is None else temperature
         self.chart = RotationVector() if chart is None else chart
-        self.points, self.above, self.dimension = points, above, dimension
+        self.points, self.above, self.upto, self.dimension = points, above, upto, dimension
         if isinstance(self.inner, GaussNewton) and (self.temperature.learned or not self.chart.scaled):
             found = self.temperature if self.temperature.learned else self.chart
             raise ValueError(f"{found!r} goes with Adam() alone: give GaussNewton() Annealed() and RotationVector()")
@@ -105,9 +108,10 @@ class Stage(nn.Module):
         return StageResult(reached.frame.leave(motion), loss, final * frame.scale, end.gradient_norm, settled)
 
     def wanted(self, pair: CloudPair) -> bool:
-        """Whether the clouds are of the dimension, and either of them as large, as the stage is for."""
+        """Whether the clouds are of the dimension, and the larger one of the size, that the stage is for."""
         _, n, d = pair.P.shape
-        return self.dimension in (None, d) and max(n, pair.Q.shape[1]) > self.above
+        larger = max(n, pair.Q.shape[1])
+        return self.dimension in (None, d) and self.above < larger <= (larger if self.upto is None else self.upto)
 
     def attach(self, pair: CloudPair, frame: Frame, ended: StageResult, damping: float) -> tuple[StageResult, str]:
         """The result with the derivative of an optimum, and in words why it may not be one; "" if it is."""
@@ -133,6 +137,7 @@ class Stage(nn.Module):
     def __repr__(self) -> str:
         sizes = "" if self.points is None else f", points={self.points}"
         sizes += "" if not self.above else f", above={self.above}"
+        sizes += "" if self.upto is None else f", upto={self.upto}"
         sizes += "" if self.dimension is None else f", dimension={self.dimension}"
         return f"Stage({self.loss!r}, {self.inner!r}, {self.temperature!r}, {self.chart!r}{sizes})"
 
@@ -145,17 +150,22 @@ def _check(loss: Loss, inner: object, temperature: object) -> None:
         raise ValueError(f"temperature is {temperature!r}; it must be Annealed(...) or Learned(...): try Annealed()")
     if inner is not None and not isinstance(inner, Adam | GaussNewton):
         raise ValueError(f"inner is {inner!r}; it must be Adam(...) or GaussNewton(...)")
+    if isinstance(loss, BuddyFilter) and loss.alike and not isinstance(inner, GaussNewton):
+        raise ValueError(f"{loss!r} weighs pairs in the equations of GaussNewton alone: give inner=GaussNewton()")
     if isinstance(temperature, Unrounded) and isinstance(loss, SoftLoss):
         raise ValueError(f"temperature is Unrounded(), and {loss!r} divides by it: try Annealed()")
     if isinstance(temperature, Unrounded) and isinstance(loss, BuddyFilter) and math.isfinite(loss.reach):
         raise ValueError(f"temperature is Unrounded(), and the reach of {loss!r} a multiple of it: try Annealed()")
 
 
-def _check_clouds(points: object, above: object, dimension: object) -> None:
+def _check_clouds(points: object, sizes: tuple[object, object], dimension: object) -> None:
     """Refuse clouds that there are not."""
     if points is not None and not (isinstance(points, int) and points >= FEWEST_POINTS):
         raise ValueError(f"points is {points}; a stage needs at least {FEWEST_POINTS} of each cloud: try 1000")
+    above, upto = sizes
     if not isinstance(above, int) or above < 0:
         raise ValueError(f"above is {above}; it must be a whole number of points, not negative: try 10000")
+    if upto is not None and not (isinstance(upto, int) and upto > above):
+        raise ValueError(f"upto is {upto}; it must be a whole number of points over above={above}, or None: try 10000")
     if dimension not in (None, 2, 3):
         raise ValueError(f"dimension is {dimension!r}; a stage is for clouds in 2 or 3 dimensions, or None: for both")

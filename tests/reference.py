@@ -94,6 +94,13 @@ def flattened(D, width):
     return flat
 
 
+def likeness(offset, p_normal, q_normal, spacing):
+    """How much a pair of points counts: half of it at one spacing, half of it at a cosine of 0.9 of the normals."""
+    apart = sum(x * x for x in offset) / spacing**2
+    cosine = abs(sum(a * b for a, b in zip(p_normal, q_normal, strict=True)))
+    return 1 / (1 + apart) * 0.1 / (0.1 + (1 - cosine))
+
+
 def normal_equations(residuals, counts):
     """sum of c J J^T and of c r J over residuals r_k, given as a function of six (in the plane three) pose numbers.
 

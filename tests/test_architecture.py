@@ -24,10 +24,13 @@ ORDER = {
         cloud_trees
         neighbours neighbourhoods distances
         normals buddies temperature spacing searches
-        kernels.scene kernels.squares
+        kernels.scene kernels.likeness
+        kernels.squares
         kernels.blocks kernels.forward_mode kernels.soft_squares
         kernels.reference kernels.matched kernels.gpu_pairs
+        kernels.cpu_limits
         kernels.cpu_pairs kernels.cpu_matched kernels.gpu_sweeps kernels.gpu_clouds
+        kernels.cpu_clipping
         kernels.cpu_matched_adjoint kernels.cpu_sweeps kernels.cpu_forces kernels.cpu_dual kernels.cpu_dual_forces
         kernels.gpu_forces
         kernels.cpu_dual_planes kernels.gpu

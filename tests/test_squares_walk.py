@@ -17,7 +17,7 @@ HOT = (1.0, 0.5)
 @pytest.mark.parametrize("damping", [1e-6, 0.3])
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("loss", [BuddyFilter(), BuddyFilter(reach=1.3)], ids=str)
+@pytest.mark.parametrize("loss", [BuddyFilter(), BuddyFilter(reach=1.3), BuddyFilter(alike=True)], ids=str)
 def test_steps_in_numpy_are_those_in_torch(loss, d, masked, damping, monkeypatch):
     given = {k: v for k, v in noisy_pair(d, batch=3, n=30, m=34).items() if "features" not in k}
     if masked:

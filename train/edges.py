@@ -1,6 +1,5 @@
 """Scans to poses: neighbours, window and loops registered by the layer, a pose graph, a refinement of all poses."""
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -132,7 +131,7 @@ def _nearness(edges: Edges, poses: RigidMotion, clouds: list[Surface], spacing: 
     What the graph doubts for the sake of sharper edges may still be near enough for its pairs, which are found anew.
     """
     apart = disagreement(poses.between(edges.target, edges.source), edges)
-    radii = torch.tensor([float(np.sqrt((cloud.points**2).sum(axis=1).mean())) for cloud in clouds])
+    radii = torch.tensor([cloud.radius for cloud in clouds])
     shift, turn = apart[:, -poses.dimension :].norm(dim=-1), apart[:, : -poses.dimension].norm(dim=-1)
     return (1 + (shift.square() + (turn * radii[edges.source]).square()) / (NEAR * spacing) ** 2).pow(-2)
 

@@ -58,7 +58,7 @@ def refine(
     progress: told each step.
     """
     poses, width = world_from_scan.copy(), FIRST_WIDTH
-    reach = np.array([np.sqrt((scan.points**2).sum(axis=1).mean()) for scan in scans])
+    radii = np.array([scan.radius for scan in scans])
     spacing = min(scan.spacing for scan in scans)
     d = poses.shape[1] - 1
     used = weights[0] > 0
@@ -69,7 +69,7 @@ def refine(
         moves, median = _gauss_newton(scans, (edges, found), poses, (trust, weights[1], width))
         poses = moved(poses, moves)
         turned, shifted = (np.linalg.norm(part, axis=1) for part in (moves[:, :-d], moves[:, -d:]))
-        settled = np.max(turned * reach + shifted) < SETTLED * spacing
+        settled = np.max(turned * radii + shifted) < SETTLED * spacing
         final = max(FINAL_WIDTH[d] * median, FINEST_WIDTH)
         if settled and width <= final:
             break

@@ -22,6 +22,11 @@ class Surface:
     tree: cKDTree
     spacing: float
 
+    @property
+    def radius(self) -> float:
+        """How far a turn by one radian moves the points about the sensor, root mean square, in the data's unit."""
+        return float(np.sqrt((self.points**2).sum(axis=1).mean()))
+
 
 def surfaces(prepared: Prepared) -> list[Surface]:
     """The scans of ``prepared``, each with its tree."""

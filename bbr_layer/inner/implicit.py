@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
+from bbr_layer.inner.charts import State
 from bbr_layer.inner.unroll import Problem, loss_gradient
 from bbr_layer.pair import CloudPair, centre_and_radius
 from bbr_layer.rotations import rotation_dimensions
@@ -39,7 +40,7 @@ def attach(problem: Problem, pair: CloudPair, motion: RigidMotion, temperature: 
     damping: share of the Hessian's mean diagonal that is added to it.
     """
     state = problem.chart.begin(motion.detach(), problem.frame)
-    _, gradient = loss_gradient(problem, state, temperature.detach(), differentiable=True)
+    gradient = _slope(problem, state, temperature.detach())
     hessian = _hessian(problem, motion.detach(), temperature.detach())
     mean = hessian.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
     eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
@@ -63,13 +64,22 @@ def doubt(attached: Attached) -> str:
     return " and ".join(reasons)
 
 
+def _slope(problem: Problem, state: State, temperature: Tensor) -> Tensor:
+    """What is 0 at the end, ``(batch, k)``: of Gauss-Newton the slope of its equations, whose weights may vary."""
+    if problem.squares is None:
+        return loss_gradient(problem, state, temperature, differentiable=True)[1]
+    motion, squares = problem.chart.motion(state, problem.frame), problem.squares
+    with torch.enable_grad():
+        return squares.squares.equations(squares.pair, motion, temperature, squares.squares.hold(motion.detach())).slope
+
+
 def _hessian(problem: Problem, motion: RigidMotion, temperature: Tensor) -> Tensor:
     """How the gradient changes as the pose is moved, ``(batch, k, k)``, without a graph."""
     with torch.enable_grad():
         batch, d = motion.translation.shape
         tangent = motion.translation.new_zeros(batch, rotation_dimensions(d) + d).requires_grad_()
         state = problem.chart.moved(problem.chart.begin(motion, problem.frame), tangent)
-        _, gradient = loss_gradient(problem, state, temperature, differentiable=True)
+        gradient = _slope(problem, state, temperature)
         rows = [torch.autograd.grad(one.sum(), tangent, retain_graph=True)[0] for one in gradient.unbind(-1)]
     return torch.stack(rows, -2).detach()
 

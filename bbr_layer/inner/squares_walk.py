@@ -79,7 +79,7 @@ class _Walk(torch.autograd.Function):
         poses.translations[:, 0] = in_space(translation.numpy())
         squares = steps.bound.squares
         assert isinstance(squares, MatchedSquares)
-        clouds, heats = matched_clouds(pair, squares.reach), temperatures.numpy()
+        clouds, heats = matched_clouds(pair, squares.reach, squares.alike), temperatures.numpy()
         settings = squares, AXES[d], steps.damping
         side_by_side(lambda b: _descend(settings, (b, clouds[b]), heats[:, b], _Poses(*(x[b] for x in poses))), batch)
         ctx.steps, ctx.poses = steps, poses

@@ -6,6 +6,7 @@ its rate of change behind it, and what is kept goes on with the rates of the dis
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_limits import limit_of
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHUNK,
@@ -29,7 +30,6 @@ from bbr_layer.kernels.cpu_pairs import (
     add_up,
     dot,
     kept_row,
-    limit_of,
     logit_rate,
     measured_rate,
     plane_square_rate,
@@ -91,9 +91,8 @@ def weights_of(rows, i):  # type: ignore[no-untyped-def]
 def buddy_sum_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """Sums of buddies and of buddies times distance, and the rates of the two: channels 0 to 3 of both ``out``."""
     wide_vectors()
-    rows, columns = sides
+    (rows, columns), limit = sides, limit_of(normals)
     scales, align, cool_rate = (constants[SMOOTH], constants[COOL]), constants[ALIGN], constants[COOL_RATE]
-    limit = limit_of(normals)
     sums = np.empty((4, columns.shape[1]), dtype=rows.dtype)
     for low in range(0, rows.shape[1], CHUNK):
         high = min(low + CHUNK, rows.shape[1])
@@ -107,11 +106,11 @@ def buddy_sum_rates(sides, normals, out, constants, kept):  # type: ignore[no-un
             if normals is not None:
                 (nx, ny, nz), (mx, my, mz) = three(normals[1], 0, first, last), three(normals[1], 3, first, last)
             for i in range(low, high):
-                (px, py, pz), (own, own_inverse, own_rate) = point_of(rows, i), weights_of(rows, i)
+                (px, py, pz), seen = point_of(rows, i), kept_row(kept, i, first, last)
+                own, own_inverse, own_rate = weights_of(rows, i)
                 if normals is not None:
                     normal = point_of(normals[0], i)
                 a = b = a_rate = b_rate = px * ZERO
-                seen = kept_row(kept, i, first, last)
                 for j in range(qx.size):
                     offset, velocity = (qx[j] - px, qy[j] - py, qz[j] - pz), (vx[j], vy[j], vz[j])
                     if normals is None:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from bbr_layer.kernels.cpu_dual_forces import add_sums, loss_rates, point_force_rates, row_rates
+from bbr_layer.kernels.cpu_limits import clipped, if_free, limit_of
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHUNK,
@@ -23,10 +24,7 @@ from bbr_layer.kernels.cpu_pairs import (
     add_at,
     add_three,
     add_up,
-    clipped,
     dot,
-    if_free,
-    limit_of,
     logit_rate,
     measured_rate,
     plane,

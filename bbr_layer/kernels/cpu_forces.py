@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_limits import clipped, if_free, limit_of
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     BY_M,
@@ -23,11 +24,8 @@ from bbr_layer.kernels.cpu_pairs import (
     add_at,
     add_three,
     add_up,
-    clipped,
     dot,
-    if_free,
     kept_row,
-    limit_of,
     measured,
     plane,
     point_of,

@@ -6,6 +6,7 @@ import numpy as np
 
 from bbr_layer.kernels.cpu_math import compiled
 from bbr_layer.kernels.cpu_turns import apply, cross
+from bbr_layer.kernels.likeness import NORMALS_APART, POINTS_APART
 from bbr_layer.pair import CloudPair
 from bbr_layer.trees import in_space
 
@@ -16,7 +17,8 @@ TANGENT = 6
 class MatchedClouds(NamedTuple):
     """One item in space, float64: points and normals ``(n, 3)`` or ``(m, 3)``, weights ``(n,)`` or ``(m,)``.
 
-    ``flat`` is one over the reach of the loss, 0 where that is infinite.
+    ``flat`` is one over the reach of the loss, 0 where that is infinite. ``near`` is one over the square of the
+    distance at which two points count half in normal equations, 0 where all pairs count alike.
     """
 
     P: np.ndarray
@@ -26,16 +28,20 @@ class MatchedClouds(NamedTuple):
     P_weights: np.ndarray
     Q_weights: np.ndarray
     flat: float
+    near: float
 
 
-def matched_clouds(pair: CloudPair, reach: float) -> list[MatchedClouds]:
-    """Each item of a pair with normals; of the plane, embedded in space. ``reach``: see ``BuddyFilter``."""
+def matched_clouds(pair: CloudPair, reach: float, alike: bool = False) -> list[MatchedClouds]:
+    """Each item of a pair with normals; of the plane, embedded in space. ``reach``, ``alike``: see ``BuddyFilter``."""
     vectors = (pair.P, pair.Q, *pair.both_normals())
     tables = [in_space(x.detach().double().numpy()) for x in vectors]
     for points, weights in ((pair.P, pair.P_weights), (pair.Q, pair.Q_weights)):
         tables.append(np.ones(points.shape[:2]) if weights is None else weights.detach().double().numpy())
+    tables.append(np.zeros(len(pair.P)))
+    if alike:
+        tables[-1] = (POINTS_APART * pair.known_spacing().detach().double().numpy()) ** -2
     items = zip(*(np.ascontiguousarray(table) for table in tables), strict=True)
-    return [MatchedClouds._make((*item, 1 / reach)) for item in items]
+    return [MatchedClouds._make((*item[:-1], 1 / reach, float(item[-1]))) for item in items]
 
 
 @compiled()
@@ -82,16 +88,25 @@ def steepness_of(flat, temperature, rounded):  # type: ignore[no-untyped-def]
 
 
 @compiled()
+def _likeness(near, offset, normals):  # type: ignore[no-untyped-def]
+    """As ``likeness.likeness``; 1 where all pairs count alike."""
+    if near == 0:
+        return 1.0
+    return NORMALS_APART / ((1 + near * dot(offset, offset)) * (1 - abs(dot(normals[0], normals[1])) + NORMALS_APART))
+
+
+@compiled()
 def _pull(clouds, pairs, j, placing):  # type: ignore[no-untyped-def]
     """How much a pair pulls per unit of its residual, the residual, and its derivative by a turn and by a shift.
 
     ``placing`` is (pose, temperature, one over the weight of all pairs).
     """
     (index, _), (pose, temperature, scale) = pairs, placing
-    arm, turned, offset, plane, _ = place_of(clouds, index[j], j, pose)
+    arm, turned, offset, plane, sign = place_of(clouds, index[j], j, pose)
     residual = dot(offset, plane)
     squared = residual * residual + temperature * temperature
-    weight = scale * clouds.P_weights[index[j]] * clouds.Q_weights[j]
+    facing = combined(sign, plane, -sign, turned)
+    weight = scale * clouds.P_weights[index[j]] * clouds.Q_weights[j] * _likeness(clouds.near, offset, (facing, turned))
     torque = combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
     rounded = np.sqrt(squared) if squared > 0 else 1.0
     steepness = steepness_of(clouds.flat, temperature, rounded)

@@ -6,6 +6,7 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
+from bbr_layer.kernels.cpu_limits import clipped, if_free
 from bbr_layer.kernels.cpu_math import ONE, TWO, ZERO, compiled, exp_negative, share_of
 
 
@@ -122,30 +123,6 @@ def plane(offset, row_normal, column_normal, align):  # type: ignore[no-untyped-
 def point_of(rows, i):  # type: ignore[no-untyped-def]
     """The first three channels of row ``i``."""
     return rows[0, i], rows[1, i], rows[2, i]
-
-
-def limit_of(normals: Any) -> Any:
-    """The square at which distances are clipped, kept behind the normals; None where none are."""
-    return None if normals is None or len(normals) == 2 else normals[2][0]
-
-
-@overload(limit_of, inline="always")
-def _limit_of(normals):  # type: ignore[no-untyped-def]
-    if normals == types.none or len(normals) == 2:
-        return lambda normals: None
-    return lambda normals: normals[2][0]
-
-
-@compiled(forceinline=True)
-def clipped(squared, limit):  # type: ignore[no-untyped-def]
-    """A square, at most the limit unless that is None."""
-    return squared if limit is None else min(squared, limit)
-
-
-@compiled(forceinline=True)
-def if_free(value, squared, limit):  # type: ignore[no-untyped-def]
-    """The value; 0 where the square is clipped."""
-    return value if limit is None else (value if squared < limit else ZERO)
 
 
 @compiled(forceinline=True)

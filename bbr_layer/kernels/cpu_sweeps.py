@@ -8,6 +8,7 @@ each computes its own). The innermost loops run over plain slices, in which LLVM
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_limits import limit_of
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
     CHUNK,
@@ -21,7 +22,7 @@ from bbr_layer.kernels.cpu_math import (
     share_of,
     wide_vectors,
 )
-from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, limit_of, measured, plane_square, point_of, three
+from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, measured, plane_square, point_of, three
 
 
 @compiled()

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bbr_layer.distances import flattened, matched_plane_normals, smooth_root
 from bbr_layer.geometry import RigidMotion
+from bbr_layer.kernels.likeness import likeness
 from bbr_layer.neighbours import MutualNeighbours
 from bbr_layer.pair import CloudPair
 
@@ -46,10 +47,11 @@ class MatchedSquares:
     ----------
     search: finds the pairs.
     reach: in temperatures, see ``BuddyFilter``. Default infinite.
+    alike: a pair counts as much as its points are alike, see ``BuddyFilter``.
     """
 
-    def __init__(self, search: MutualNeighbours, reach: float = math.inf):
-        self.search, self.reach = search, reach
+    def __init__(self, search: MutualNeighbours, reach: float = math.inf, alike: bool = False):
+        self.search, self.reach, self.alike = search, reach, alike
 
     def hold(self, motion: RigidMotion) -> tuple[Tensor, ...]:
         """Indices of the nearest target points, and which choices are mutual, ``(batch, m)`` each."""
@@ -64,7 +66,8 @@ class MatchedSquares:
         moved = pair.moved_by(motion)
         _, turned = moved.both_normals()
         offsets = (moved.Q - gathered(pair.P, index)).double()
-        planes = matched_plane_normals(gathered(P_normals, index), turned).double()
+        facing = gathered(P_normals, index)
+        planes = matched_plane_normals(facing, turned).double()
         residual = (offsets * planes).sum(-1)
         weights = mutual.double()
         if pair.P_weights is not None:
@@ -72,6 +75,8 @@ class MatchedSquares:
         if pair.Q_weights is not None:
             weights = weights * pair.Q_weights
         share = weights / or_one(weights.sum(-1, keepdim=True))
+        if self.alike:
+            share = share * likeness(offsets, (facing.double(), turned.double()), pair.known_spacing().double())
         rounding = temperature.double()[:, None]
         rounded = smooth_root(residual.square(), rounding)
         pull = share * (flattened(rounded, rounding, self.reach) / or_one(rounded)).square() / or_one(rounded)
