@@ -19,7 +19,7 @@ from bbr_layer import (
     Unrounded,
     angular_error,
 )
-from bbr_layer.named_stages import REACH
+from bbr_layer.named_stages import FINE_POINTS, REACH
 from bbr_layer.thinning import evenly_thinned, thinned_pair
 
 
@@ -83,10 +83,13 @@ def test_f_begins_as_the_papers_on_at_most_1000_points_and_goes_on_with_a_reach(
     for count in (1000, 1010):
         result = layer(P[:count], truth.inverse()(P[:count]))
         assert result.iterations.item() == sum(stage.inner.steps for stage in stages if stage.above < count)
+        assert all(stage.upto in (None, FINE_POINTS) for stage in stages)
         assert angular_error(result.target_from_source.rotation, truth.rotation) < 1e-3
     assert (stages[1].points, stages[1].above, stages[1].loss.reach) == (1000, 0, math.inf)
     assert all(stage.loss.reach == REACH for stage in stages[2:])
-    assert {stage.above for stage in stages[2:-1]} <= {0, 1000} and stages[-1].points is None
+    assert {stage.above for stage in stages[2:-2]} <= {0, 1000, FINE_POINTS} and stages[-1].points is None
+    assert [stage.loss.alike for stage in stages[2:]] == [stage.upto is not None for stage in stages[2:]]
+    assert (stages[-2].loss.alike, stages[-2].above, stages[-1].above) == (True, 0, FINE_POINTS)
 
 
 @pytest.mark.parametrize("layer", [BBRLayer(backward=Detached()), BBRLayer.fast(Detached())], ids=["default", "fast"])
