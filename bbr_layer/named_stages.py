@@ -35,8 +35,8 @@ FINE_POINTS = 10_000
 # and end farther off, three iterations a little.
 LAST_ITERATIONS, LAST_ROUNDING = 5, (0.1, 0.03)
 # Iterations of Gauss-Newton, and their rounding in point spacings, in which pairs count as much as their points are
-# alike: two fifths less error beside a distractor, on models up to two fifths, benchmarks/likeness.md. Not on larger
-# clouds, as lidar scans are, of which few pairs lie within a spacing that is a centimetre near the sensor.
+# alike: two fifths less error beside a distractor, on models up to two fifths, benchmarks/likeness.md. Chosen: not on
+# larger clouds, as lidar scans are, of which few pairs lie within a spacing that is a centimetre near the sensor.
 ALIKE_ITERATIONS, ALIKE_ROUNDING = 10, 0.03
 
 
@@ -79,9 +79,8 @@ def _planar_last_stage(above: int = 0) -> Stage:
 
 
 def _alike_stage(inner: Inner, temperature: Temperature | None = None) -> Stage:
-    plain = named_stage("F", inner, temperature)
-    loss = BuddyFilter(reach=REACH, alike=True)
-    return Stage(loss, plain.inner, plain.temperature, upto=FINE_POINTS, dimension=3)
+    plain = _filter_stage(inner, temperature)
+    return Stage(BuddyFilter(reach=REACH, alike=True), inner, plain.temperature, upto=FINE_POINTS, dimension=3)
 
 
 def _spatial_last_stage() -> Stage:

@@ -82,7 +82,8 @@ def table(results: dict[str, dict[str, dict[str, float]]]) -> str:
     head = (
         f"Made by `python -m benchmarks.crispness` on {cpu_name()}: mean map entropy in nats (Razlaw et al., 2015) of\n"
         "all points, the lower the crisper; in brackets the row's error of `benchmarks/mapping_table.md`, metres.\n"
-        "Each kind of small_gicp with the crispest of its three settings, with and without turned starts.\n"
+        "Each kind of small_gicp with the crispest of its three settings, with and without turned starts. Rows are\n"
+        "kept from run to run: these are of several.\n"
     )
     titles = f"| sequence | radius, m | truth | ours | {' | '.join(KINDS)} |"
     rows = [line(name, results[name]) for name in ROWS if name in results]

@@ -163,7 +163,7 @@ def test_a_second_derivative_is_refused_or_given():
     )
 
 
-@pytest.mark.parametrize("name", ["softBBS", "softBD", "F"])  # N ends in a cycle, 2e-5 wide
+@pytest.mark.parametrize("name", ["softBBS", "softBD", "F"])  # N ends in a small cycle
 def test_implicit_is_replay_where_it_has_converged(name):
     P = bumpy(60, 3)
     Q = motion(3, 0.1, 0.02).inverse()(P + 0.01 * torch.randn_like(P))
