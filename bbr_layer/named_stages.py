@@ -12,9 +12,9 @@ from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD, SoftBDNormals
 from bbr_layer.stage import SOFT_SMOOTHING, Inner, Stage
 from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
 
-# Points of each cloud that soft buddies are sought among, whose cost grows with the square: on streets 1000 lead to
-# where F goes on (benchmarks/lidar.md). The fast ones trade basin for time: benchmarks/solvers.md.
-SOFT_POINTS, FAST_SOFT_POINTS = 1000, 300
+# Points of each cloud that soft buddies are sought among, whose cost grows with the square. More are no better:
+# benchmarks/soft_points.md. The fast ones trade basin for time: benchmarks/solvers.md.
+SOFT_POINTS, FAST_SOFT_POINTS = 400, 300
 # Points of each cloud that F begins on: its basin is as wide as the points are sparse. Chosen on the distractor of
 # docs/experiments.md, Fig. 5.
 FIRST_POINTS = 1000
@@ -29,6 +29,8 @@ PLANAR_POINTS, PLANAR_ITERATIONS, PLANAR_ROUNDING = 64, 20, (0.3, 0.03)
 # Temperatures beyond which a pair hardly pulls in F: at the end 1.5 point spacings of Eq. 7, which adds two normals.
 # Measured: a sixth to a half less error beside a distractor, about the same on whole models; benchmarks/reach.md.
 REACH = 50.0
+# Steps of that, and their rate: in space Gauss-Newton ends it, which is where the derivative converges. Chosen.
+REACH_STEPS, REACH_RATE = 100, 0.01
 # Points of each cloud that most of F's steps see; the last few see all. Chosen: a twelfth of a full lidar scan.
 FINE_POINTS = 10_000
 # How many, and their rounding in point spacings. Chosen on lidar pairs: 30 steps of Adam at a small rate take longer
@@ -49,13 +51,14 @@ def default_stages(soft_points: int = SOFT_POINTS) -> list[Stage]:
     64 points, and Gauss-Newton ends on all.
     """
     flat, begin = Clouds(points=min(soft_points, PLANAR_POINTS), dimension=2), Adam(FIRST_STEPS, FIRST_RATE)
+    goes_on = Adam(REACH_STEPS, REACH_RATE)
     rounding = Annealed(FIRST_ROUNDING, FIRST_ROUNDING)
     planar = [named_stage("softBBS", **flat), named_stage("F", begin, rounding, **flat), _filter_stage(**flat)]
     spatial = [
         named_stage("softBBS", points=soft_points, dimension=3),
         named_stage("F", begin, rounding, points=FIRST_POINTS, dimension=3),
-        _filter_stage(points=FIRST_POINTS, above=FIRST_POINTS, dimension=3),
-        _filter_stage(points=FINE_POINTS, dimension=3),
+        _filter_stage(goes_on, points=FIRST_POINTS, above=FIRST_POINTS, dimension=3),
+        _filter_stage(goes_on, points=FINE_POINTS, dimension=3),
         _alike_stage(GaussNewton(ALIKE_ITERATIONS), Annealed(ALIKE_ROUNDING, ALIKE_ROUNDING)),
     ]
     return [*planar, _planar_last_stage(above=min(soft_points, PLANAR_POINTS)), *spatial, _spatial_last_stage()]

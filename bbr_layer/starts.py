@@ -67,11 +67,11 @@ class Chosen(NamedTuple):
 def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame], begun: RigidMotion) -> Chosen:
     """Run ``stages`` from ``count`` rotations about the source's centroid; the start that ended best, per item.
 
-    All of them see only the points of the first one. Best is the most buddies that lie on each other's planes, counted
-    softly: of a wrong answer many points have a buddy, but few fit. Without normals it is the lowest softBBS (Eq. 5) at
-    one point spacing. The first start stays where none is clearly better. The stages are to be run again from the
-    chosen start, which gives the gradient of that run: to go on from where it ended instead would make the first steps,
-    as long as ever, answer to a gradient of nearly 0.
+    All of them see only the points of the second one, where F begins. Best is the most buddies that lie on each other's
+    planes, counted softly: of a wrong answer many points have a buddy, but few fit. Without normals it is the lowest
+    softBBS (Eq. 5) at one point spacing. The first start stays where none is clearly better. The stages are to be run
+    again from the chosen start, which gives the gradient of that run: to go on from where it ended instead would make
+    the first steps, as long as ever, answer to a gradient of nearly 0.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
     ------
     ValueError: more starts than there are.
     """
-    pair, frame = thinned_pair(clouds[0], stages[0].points), clouds[1]
+    pair, frame = thinned_pair(clouds[0], _tried_points(stages)), clouds[1]
     batch, d = begun.translation.shape
     if count > most_starts(d):
         raise ValueError(f"starts is {count}; in {d}D there are {most_starts(d)} of them at most: try 7")
@@ -103,6 +103,12 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
     begun = frame.leave(RigidMotion(turned[items, chosen], entered.translation))
     whole = pair.P.shape == clouds[0].P.shape and pair.Q.shape == clouds[0].Q.shape
     return Chosen(begun, _heated(stages[0], chosen > 0), _of(ended, items * count + chosen) if whole else None)
+
+
+def _tried_points(stages: list[Stage]) -> int | None:
+    """How many points the later of the first two stages sees that does not see all; None where both do."""
+    few = [stage.points for stage in stages[:2] if stage.points is not None]
+    return few[-1] if few else None
 
 
 def _tried(

@@ -78,6 +78,15 @@ def test_starts_are_compared_on_few_points_and_without_the_stages_for_many():
     assert not hasattr(large, "seen")
 
 
+def test_starts_are_compared_on_the_points_that_the_second_stage_sees():
+    P, Q, _ = _turned(3, 90, 1)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    soft, fine = named_stage("softBBS", points=50), _Seen(BuddyFilter(), Adam(3, 0.005), points=100)
+    last = _Seen(BuddyFilter(), Adam(3, 0.005))
+    best_start(7, [soft, fine, last], (pair, frame), RigidMotion.identity(3, (1,)))
+    assert 80 <= fine.seen[1] <= 100 and last.seen[1] == fine.seen[1]
+
+
 def test_the_score_counts_buddies_on_each_others_planes():
     P, Q, truth = _turned(3, 20, 3)
     _, pair = prepared(CloudPair(P[None], Q[None]), True, False)
