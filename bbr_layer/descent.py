@@ -18,12 +18,17 @@ def descended(stages: list[Stage], clouds: tuple[CloudPair, Frame], motion: Rigi
     motion: where to begin, between the user's frames.
     mode: which steps keep a graph, counted over all stages.
     """
-    steps, done = sum(stage.inner.steps for stage in stages), 0
+    steps, done = inner_steps(stages), 0
     for stage in stages:
         attached, last = partial(_attached, mode, done, steps), stage is stages[-1]
         ended = stage(*clouds, motion, attached, closed_form=mode.closed_form, last=last)
         motion, done = ended.motion, done + stage.inner.steps
     return ended
+
+
+def inner_steps(stages: list[Stage]) -> int:
+    """How many steps all of them take."""
+    return sum(stage.inner.steps for stage in stages)
 
 
 def _attached(mode: Backward, done: int, steps: int, step: int) -> bool:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from bbr_layer.backward import Backward, Detached, Implicit, Replay, speak_up
-from bbr_layer.descent import descended
+from bbr_layer.descent import descended, inner_steps
 from bbr_layer.door import batch_shape, checked_pair, checked_start
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.named_stages import default_stages, fast_stages, named_stage, paper_stage
@@ -167,12 +167,11 @@ class BBRLayer(nn.Module):
         stages = [stage for stage in self.sequence if stage.wanted(pair)]
         if not stages:
             raise ValueError(f"P is in {pair.P.shape[-1]}D, and no stage of the layer is for such: try dimension=None")
-        steps = sum(stage.inner.steps for stage in stages)
         starts = self.starts or (ROBUST_STARTS if start is None and stages[0].dimension == 2 else 1)
         if starts > 1:
-            motion, stages[0], tried = best_start(starts, stages, (pair, frame), motion)
-            if tried is not None and not differentiable:
-                return judged(pair, frame, tried, steps)
+            motion, stages, tried, whole = best_start(starts, stages, (pair, frame), motion)
+            if whole and not differentiable:
+                return judged(pair, frame, tried, inner_steps(stages))
         mode = self.backward_mode if differentiable else Detached()
         ended = descended(stages, (pair, frame), motion, mode)
         if isinstance(mode, Implicit):
@@ -181,7 +180,7 @@ class BBRLayer(nn.Module):
                 ended = descended(stages, (pair, frame), motion, Replay())
             elif doubt:
                 speak_up(mode, doubt)
-        return judged(pair, frame, ended, steps)
+        return judged(pair, frame, ended, inner_steps(stages))
 
     def _wants_gradient(self, pair: CloudPair, start: RigidMotion | None) -> bool:
         settings = [x for m in self.modules() for x in vars(m).values() if isinstance(x, Tensor)]

@@ -48,7 +48,7 @@ class Registration(NamedTuple):
     loss: ``(*batch,)`` last stage's loss at the final pose, in its frame's units; differentiable.
     temperature: ``(*batch,)`` final temperature in the data's unit.
     gradient_norm: ``(*batch,)`` of the last step taken.
-    iterations: ``(*batch,)`` inner steps done.
+    iterations: ``(*batch,)`` inner steps of the run that gave the answer.
     buddies: ``(*batch,)`` how many pairs are mutual nearest neighbours at the final pose.
     information: ``(*batch, k, k)`` with k = d (d + 1) / 2: sum of J^T J over those pairs, for residuals in data units
         (point to plane where there are normals, else point to point) and a tangent of rotation (radians) before

@@ -78,7 +78,7 @@ def test_a_registration_cut_short_is_another_matter():
     assert not ((shares > 1 / FACTOR) & (shares < FACTOR)).all()
 
 
-@pytest.mark.parametrize("layer", [BBRLayer(), BBRLayer.fast()], ids=["default", "fast"])
+@pytest.mark.parametrize("layer", [BBRLayer(), BBRLayer.fast(), BBRLayer.robust()], ids=["default", "fast", "robust"])
 @pytest.mark.parametrize("kind", ["another sample", "an exact copy"])
 def test_the_gradient_through_all_stages_is_that_of_central_differences(layer, kind):
     P = bumpy(100, 3)

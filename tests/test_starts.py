@@ -6,7 +6,17 @@ import pytest
 import torch
 from problems import bumpy, motion
 
-from bbr_layer import BBRLayer, CloudPair, Detached, RigidMotion, Stage, angular_error, hard_buddies
+from bbr_layer import (
+    Annealed,
+    BBRLayer,
+    CloudPair,
+    Detached,
+    GaussNewton,
+    RigidMotion,
+    Stage,
+    angular_error,
+    hard_buddies,
+)
 from bbr_layer.inner.adam import Adam
 from bbr_layer.losses import BuddyFilter
 from bbr_layer.named_stages import default_stages, named_stage
@@ -39,7 +49,32 @@ def test_several_starts_find_what_one_misses(d, degrees, seed):
 def test_an_easy_pair_is_registered_as_from_one_start():
     P, Q, _ = _turned(3, 20, 0)
     one, several = BBRLayer(backward=Detached())(P, Q), BBRLayer.robust(Detached())(P, Q)
-    assert torch.equal(one.target_from_source.matrix, several.target_from_source.matrix)
+    assert _error(several, one.target_from_source) < 0.01
+    plain = [BBRLayer(*default_stages()[-5:-1], backward=Detached(), starts=starts) for starts in (1, 7)]
+    assert torch.equal(*(layer(P, Q).target_from_source.matrix for layer in plain))
+
+
+@pytest.mark.parametrize(("name", "cell", "seed"), [("fig4", 0, 1019), ("fig5", 1, 2002)])
+def test_what_f_from_afar_pulls_past_is_found_from_about_the_answer(name, cell, seed, real_data, monkeypatch):
+    experiment = next(experiment for experiment in EXPERIMENTS if experiment.name == name)
+    trial = experiment.cells("disjoint")[cell].make(seed)
+    layer = BBRLayer.robust(Detached())
+    assert trial.errors(layer(trial.P, trial.Q).target_from_source)[0] < 2
+    monkeypatch.setattr("bbr_layer.starts.AROUND", 0.0)
+    assert trial.errors(layer(trial.P, trial.Q).target_from_source)[0] > 5
+
+
+def test_only_an_f_of_finite_reach_in_space_is_begun_again_about_its_answer():
+    P, Q, _ = _turned(3, 20, 0)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    last = Stage(BuddyFilter(reach=50.0), GaussNewton(2), Annealed(0.03, 0.03))
+    for stages, kinds in (([named_stage("F")], [Adam]), ([named_stage("F"), last], [GaussNewton, GaussNewton])):
+        found = best_start(3, stages, (pair, frame), RigidMotion.identity(3, (1,)))
+        assert [type(stage.inner) for stage in found.stages] == kinds
+    P, Q, _ = _turned(2, 20, 0)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    found = best_start(3, [named_stage("F"), last], (pair, frame), RigidMotion.identity(2, (1,)))
+    assert [type(stage.inner) for stage in found.stages] == [Adam, GaussNewton]
 
 
 def test_only_other_starts_begin_hotter():
@@ -48,17 +83,17 @@ def test_only_other_starts_begin_hotter():
     begun = RigidMotion.identity(3, (1,))
     far = best_start(7, [named_stage("softBBS")], (pair, frame), begun)
     assert not torch.equal(far.motion.rotation, begun.rotation)
-    assert far.stage.temperature.start == HOT
-    assert best_start(7, [named_stage("F")], (pair, frame), begun).stage.temperature.start == 0.3
+    assert far.stages[0].temperature.start == HOT
+    assert best_start(7, [named_stage("F")], (pair, frame), begun).stages[0].temperature.start == 0.3
     easy = best_start(7, [named_stage("softBBS")], (pair, frame), BBRLayer.robust(Detached())(P[None], Q[None])[0])
-    assert easy.stage.temperature.start == named_stage("softBBS").temperature.start
+    assert easy.stages[0].temperature.start == named_stage("softBBS").temperature.start
 
 
 def test_the_chosen_stage_sees_as_few_points_as_it_was_to():
     P, Q, _ = _turned(3, 90, 1)
     frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
     stage = named_stage("softBBS", points=50)
-    assert best_start(7, [stage], (pair, frame), RigidMotion.identity(3, (1,))).stage.points == 50
+    assert best_start(7, [stage], (pair, frame), RigidMotion.identity(3, (1,))).stages[0].points == 50
 
 
 class _Seen(Stage):
