@@ -29,10 +29,11 @@ class BBRLayer(nn.Module):
     ----------
     stages: ``Stage`` objects, each starting where the last one ended; or one of the paper's names ``"softBBS"``,
         ``"softBD"``, ``"N"``, ``"F"`` for a single scale-free stage. None: the measured default, softBBS then F.
-    starts: how many starting rotations are tried as one batch, 1 or more, on as few points as the first stage sees. The
-        one kept ends with most buddies on each other's planes (softBBS without normals). The gradient is that of the
-        run from there; the choice has none. ``BBRLayer.robust()`` tries 7, which costs about five times as much. None:
-        1, or with stages for the plane alone, as the default's there, 7 if no start is given (benchmarks/planar.md).
+    starts: how many starting rotations are tried as one batch, on as few points as the second stage sees; the one that
+        ends with most buddies on each other's planes is kept (without normals: lowest softBBS). In 3D, without
+        features, an F of finite reach ends from about that answer once more (benchmarks/around.md). The gradient is
+        that of the last run; the choice has none. None: 1, or in the plane by default 7, if no start is given
+        (benchmarks/planar.md); ``BBRLayer.robust()`` tries 7 (benchmarks/starts.md).
     backward: how gradients reach the inputs: ``Replay()`` (default, exact), ``Truncated(last_steps)``,
         ``Implicit()``, ``Autograd()`` (second derivatives) or ``Detached()``.
     inner, temperature: settings of the one stage that is given by name.

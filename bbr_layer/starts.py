@@ -82,9 +82,10 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
     softBBS (Eq. 5) at one point spacing. The first start stays where none is clearly better.
 
     Where the stages end, in space, with an F of finite reach, its iterations are then begun from rotations about the
-    best answer in the same way: F from afar has pulled some of them past the right one. The stages are to be run again
-    from the chosen start, which gives the gradient of that run: to go on with steps of Adam from where it ended instead
-    would make the first steps, as long as ever, answer to a gradient of nearly 0.
+    best answer in the same way: F from afar has pulled some of them past the right one. Not with features, whose
+    gradient soft buddies alone have. The stages are to be run again from the chosen start, which gives the gradient of
+    that run: to go on with steps of Adam from where it ended instead would make the first steps, as long as ever,
+    answer to a gradient of nearly 0.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
     tried = thinned_pair(clouds[0], _tried_points(stages))
     found = _best_turn(stages, (tried, clouds[1]), begun, turns(count, d))
     loss = stages[-1].loss
-    if d == SPACE and isinstance(loss, BuddyFilter) and math.isfinite(loss.reach):
+    if d == SPACE and isinstance(loss, BuddyFilter) and math.isfinite(loss.reach) and tried.P_features is None:
         inner, rounding = GaussNewton(AROUND_ITERATIONS), Annealed(*AROUND_ROUNDING)
         around = Stage(BuddyFilter(reach=loss.reach), inner, rounding, points=AROUND_POINTS)
         near = turns(1 + 2 * rotation_dimensions(d), d, AROUND)

@@ -50,7 +50,8 @@ def test_an_easy_pair_is_registered_as_from_one_start():
     P, Q, _ = _turned(3, 20, 0)
     one, several = BBRLayer(backward=Detached())(P, Q), BBRLayer.robust(Detached())(P, Q)
     assert _error(several, one.target_from_source) < 0.01
-    plain = [BBRLayer(*default_stages()[-5:-1], backward=Detached(), starts=starts) for starts in (1, 7)]
+    stages = named_stage("softBBS"), named_stage("F")
+    plain = [BBRLayer(*stages, backward=Detached(), starts=starts) for starts in (1, 7)]
     assert torch.equal(*(layer(P, Q).target_from_source.matrix for layer in plain))
 
 
@@ -142,6 +143,14 @@ def test_scans_of_which_a_wrong_start_finds_nearly_as_many_buddies(seed, real_da
     trial = fig7.cells("disjoint")[0].make(seed)
     result = BBRLayer.robust(Detached())(trial.P, trial.Q)
     assert trial.errors(result.target_from_source)[0] < 2
+
+
+def test_features_keep_the_gradient_that_soft_buddies_give_them():
+    P, Q, _ = _turned(3, 20, 0)
+    features = P.clone().requires_grad_()
+    result = BBRLayer.robust()(P, Q, P_features=features, Q_features=P)
+    (gradient,) = torch.autograd.grad(result.target_from_source.translation.sum(), features)
+    assert gradient.abs().max() > 0
 
 
 def test_a_start_without_a_score_is_not_chosen(monkeypatch):
