@@ -83,9 +83,10 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
 
     Where the stages end, in space, with an F of finite reach, its iterations are then begun from rotations about the
     best answer in the same way: F from afar has pulled some of them past the right one. Not with features, whose
-    gradient soft buddies alone have. The stages are to be run again from the chosen start, which gives the gradient of
-    that run: to go on with steps of Adam from where it ended instead would make the first steps, as long as ever,
-    answer to a gradient of nearly 0.
+    gradient soft buddies alone have. On more points than were tried they go on from where they ended on those.
+
+    The stages are to be run again from the chosen start, which gives the gradient of that run: to go on with steps of
+    Adam from where it ended instead would make the first ones, as long as ever, answer to a gradient of nearly 0.
 
     Parameters
     ----------
@@ -101,6 +102,7 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
     if count > most_starts(d):
         raise ValueError(f"starts is {count}; in {d}D there are {most_starts(d)} of them at most: try 7")
     tried = thinned_pair(clouds[0], _tried_points(stages))
+    whole = tried.P.shape == clouds[0].P.shape and tried.Q.shape == clouds[0].Q.shape
     found = _best_turn(stages, (tried, clouds[1]), begun, turns(count, d))
     loss = stages[-1].loss
     if d == SPACE and isinstance(loss, BuddyFilter) and math.isfinite(loss.reach) and tried.P_features is None:
@@ -108,7 +110,8 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
         around = Stage(BuddyFilter(reach=loss.reach), inner, rounding, points=AROUND_POINTS)
         near = turns(1 + 2 * rotation_dimensions(d), d, AROUND)
         found = _best_turn([around, stages[-1]], (tried, clouds[1]), found.ended.motion, near)
-    return found._replace(whole=tried.P.shape == clouds[0].P.shape and tried.Q.shape == clouds[0].Q.shape)
+        found = found if whole else found._replace(motion=found.ended.motion)
+    return found._replace(whole=whole)
 
 
 def _best_turn(

@@ -12,13 +12,13 @@ ACCURATE, SURE = (next(x for x in METHODS if x.name == name) for name in ("BBRLa
 
 
 # What the list below comes to. Written by hand after a run of 20 repeats: read it again when the list changes.
-SUMMARY = """In short. Nearly every peer is faster, those of small_gicp mostly by ten times and more. From one
+SUMMARY = """In short. Nearly every peer is faster, those of small_gicp mostly by several times. From one
 start, `BBRLayer()` loses turns of 90 degrees and some of 60, where FPFH + RANSAC does not care; seven lose none of
-them, at four to six times the cost. On whole models without shared points a peer ends a hair nearer in two of nine
-cells, beside a distractor and in partial overlap in none. On lidar nobody fails; a peer is nearer in angle in half of
+them, at four to five times the cost. On whole models without shared points a peer ends a hair nearer in one of nine
+cells, beside a distractor and in partial overlap in none. On lidar we never fail; a peer is nearer in angle in half of
 the columns, in translation in nearly all, by millimetres to a centimetre. On bun180 and bun270, 5 cm off, seven starts
-lose 1 of 40, where the others lose 23 to 40. Beside a distractor nearly as dense as the model seven starts lose none
-of 20 where the clouds share no point (the peers 10 to 20), and 1 where they do (2 to 18)."""
+lose 2 of 40, where the others lose 23 to 40. Beside a distractor nearly as dense as the model seven starts lose none
+of 20 (the peers 10 to 20 where the clouds share no point, 2 to 18 where they do)."""
 
 
 def where_we_lose(benches: list[Bench]) -> Iterator[str]:

@@ -65,6 +65,13 @@ def test_what_f_from_afar_pulls_past_is_found_from_about_the_answer(name, cell, 
     assert trial.errors(layer(trial.P, trial.Q).target_from_source)[0] > 5
 
 
+def test_of_more_points_than_are_tried_the_iterations_go_on_from_where_those_ended(real_data):
+    experiment = next(experiment for experiment in EXPERIMENTS if experiment.name == "fig5")
+    trial = experiment.cells("disjoint")[2].make(4)
+    result = BBRLayer.robust(Detached())(trial.P.float(), trial.Q.float())
+    assert len(trial.P) > 1000 and trial.errors(result.target_from_source)[0] < 1
+
+
 def test_only_an_f_of_finite_reach_in_space_is_begun_again_about_its_answer():
     P, Q, _ = _turned(3, 20, 0)
     frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
