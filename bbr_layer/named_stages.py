@@ -14,7 +14,7 @@ from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
 
 # Points of each cloud that soft buddies are sought among, whose cost grows with the square. More are no better:
 # benchmarks/soft_points.md. The fast ones trade basin for time: benchmarks/solvers.md.
-SOFT_POINTS, FAST_SOFT_POINTS = 400, 300
+SOFT_POINTS, FAST_SOFT_POINTS = 500, 300
 # Points of each cloud that F begins on: its basin is as wide as the points are sparse. Chosen on the distractor of
 # docs/experiments.md, Fig. 5.
 FIRST_POINTS = 1000

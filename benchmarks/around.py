@@ -17,7 +17,7 @@ from bbr_layer import BBRLayer, Detached, atomic_write, starts
 from benchmarks.paper_experiments import EXPERIMENTS, Cell
 
 TURNS_DEG = (0.0, 4.0, 8.0, 12.0, 16.0)
-CHOSEN = ("fig3", "fig4", "fig5", "fig7")
+CHOSEN = ("fig4", "fig5", "fig7")
 FIRST_SEED = 1000
 FAILED_DEG = 5.0
 
