@@ -17,7 +17,7 @@ start, `BBRLayer()` loses turns of 90 degrees and some of 60, where FPFH + RANSA
 them, at four to five times the cost. On whole models without shared points a peer ends a hair nearer in one of nine
 cells, beside a distractor and in partial overlap in none. On lidar we never fail; a peer is nearer in angle in half of
 the columns, in translation in nearly all, by millimetres to a centimetre. On bun180 and bun270, 5 cm off, seven starts
-lose 2 of 40, where the others lose 23 to 40. Beside a distractor nearly as dense as the model seven starts lose none
+lose none of 40, where the others lose 23 to 40. Beside a distractor nearly as dense as the model seven starts lose none
 of 20 (the peers 10 to 20 where the clouds share no point, 2 to 18 where they do)."""
 
 
