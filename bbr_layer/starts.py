@@ -36,8 +36,8 @@ NEAR, ON_PLANE = 2.0, 0.3
 # starts that end alike. Chosen.
 RELUCTANCE = 0.05
 # Radians between starts about the best answer; the iterations, rounding in point spacings and most points of each cloud
-# that they are given before the last stage. Measured beside a distractor and in partial overlap, benchmarks/around.md;
-# not in the plane, where whole turns decide.
+# that they are given before the last stage. Measured beside a distractor and in partial overlap, where few pairs need
+# them: benchmarks/around.md and tests/test_starts.py. Not in the plane, where whole turns decide.
 AROUND, SPACE = math.radians(8), 3
 AROUND_ITERATIONS, AROUND_ROUNDING, AROUND_POINTS = 8, (0.3, 0.03), FINE_POINTS
 
