@@ -12,8 +12,8 @@ from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD, SoftBDNormals
 from bbr_layer.stage import SOFT_SMOOTHING, Inner, Stage
 from bbr_layer.temperature import Annealed, Learned, Temperature, Unrounded
 
-# Points of each cloud that soft buddies are sought among, whose cost grows with the square. More are about as
-# good: benchmarks/soft_points.md. Chosen over 400, with which twice as many turns of 60 degrees are lost in the trials of
+# Points of each cloud that soft buddies are sought among, whose cost grows with the square. More are about as good:
+# benchmarks/soft_points.md. Chosen over 400, with which twice as many turns of 60 degrees are lost in the trials of
 # benchmarks/solvers.md. The fast ones trade basin for time, seen there.
 SOFT_POINTS, FAST_SOFT_POINTS = 500, 300
 # Points of each cloud that F begins on: its basin is as wide as the points are sparse. Chosen on the distractor of
