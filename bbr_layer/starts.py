@@ -71,7 +71,7 @@ class Chosen(NamedTuple):
     motion: RigidMotion
     stages: list[Stage]
     ended: StageResult
-    whole: bool
+    whole: bool = True
 
 
 def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame], begun: RigidMotion) -> Chosen:
@@ -134,7 +134,7 @@ def _best_turn(
         chosen = scores.argmax(1)
     items = torch.arange(batch, device=device)
     motion = frame.leave(RigidMotion(turned[items, chosen], entered.translation))
-    return Chosen(motion, [_heated(stages[0], chosen > 0), *stages[1:]], _of(ended, items * count + chosen), whole=True)
+    return Chosen(motion, [_heated(stages[0], chosen > 0), *stages[1:]], _of(ended, items * count + chosen))
 
 
 def _tried_points(stages: list[Stage]) -> int | None:

@@ -44,7 +44,7 @@ def register_clouds(
     loss: "softBBS", "softBD", "N" or "F" alone; "default": what the preset has.
     preset: "default", "fast" (``BBRLayer.fast()``) or "robust" (``BBRLayer.robust()``).
     start: ``(d + 1, d + 1)`` target_from_source to begin with; None: in place or centroid on centroid.
-    starts: how many starting rotations the first stage tries, see ``BBRLayer``; None: as the preset has it.
+    starts: how many starting rotations are tried, see ``BBRLayer``; None: as the preset has it.
     soft_points: how many points of each cloud the soft stages see, spread evenly.
 
     Raises

@@ -15,11 +15,12 @@ import torch
 
 from bbr_layer import BBRLayer, Detached, atomic_write, starts
 from benchmarks.paper_experiments import EXPERIMENTS, Cell
+from benchmarks.paper_methods import by_layer
+from benchmarks.paper_results import spread
 
 TURNS_DEG = (0.0, 4.0, 8.0, 12.0, 16.0)
 CHOSEN = ("fig4", "fig5", "fig7")
 FIRST_SEED = 1000
-FAILED_DEG = 5.0
 
 
 def row(cell: Cell, repeats: int) -> str:
@@ -28,18 +29,14 @@ def row(cell: Cell, repeats: int) -> str:
     degrees, seconds = np.zeros((repeats, len(TURNS_DEG))), 0.0
     for number in range(repeats):
         trial = cell.make(FIRST_SEED + number)
-        P, Q = trial.P.float(), trial.Q.float()
         for column, turn in enumerate(TURNS_DEG):
             starts.AROUND = math.radians(turn)
             before = time.process_time()
-            result = layer(P, Q)
+            found = by_layer(layer, trial)
             seconds += (time.process_time() - before) * (starts.AROUND == own)
-            degrees[number, column] = trial.errors(result.target_from_source)[0]
+            degrees[number, column] = trial.errors(found)[0]
     starts.AROUND = own
-    middle, high = np.quantile(degrees, (0.5, 0.9), axis=0)
-    failed = (degrees > FAILED_DEG).sum(0)
-    cells = [f"{a:.3f} / {b:.3f}" + f" ({k})" * bool(k) for a, b, k in zip(middle, high, failed, strict=True)]
-    return f"| {cell.name} | " + " | ".join(cells) + f" | {seconds / repeats:.2f} |"
+    return f"| {cell.name} | " + " | ".join(map(spread, degrees.T)) + f" | {seconds / repeats:.2f} |"
 
 
 def main() -> None:
@@ -59,10 +56,9 @@ def main() -> None:
         "|---" * (len(TURNS_DEG) + 2) + "|",
     ]
     for experiment in EXPERIMENTS:
+        figure = experiment.title.partition(":")[0]
         for cell in experiment.cells("disjoint") if experiment.name in CHOSEN else []:
-            lines.append(
-                row(cell._replace(panel=f"{experiment.title.partition(':')[0]} {cell.panel}"), options.repeats)
-            )
+            lines.append(row(cell._replace(panel=f"{figure} {cell.panel}"), options.repeats))
             print(lines[-1], flush=True)
     with atomic_write(options.out) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -13,11 +13,11 @@ import torch
 
 from bbr_layer import BBRLayer, BuddyFilter, Detached, GaussNewton, Stage, atomic_write
 from benchmarks.paper_experiments import EXPERIMENTS, Cell
+from benchmarks.paper_results import spread
 from benchmarks.paper_trials import SAMPLINGS
 
 CHOSEN = ("fig3", "fig4", "fig5")
 FIRST_SEED = 1000
-FAILED_DEG = 5.0
 
 
 def is_alike(stage: Stage) -> bool:
@@ -47,12 +47,7 @@ def row(cell: Cell, sampling: str, chosen: dict[str, BBRLayer], repeats: int) ->
         normals = {} if trial.P_normals is None else {"P_normals": trial.P_normals, "Q_normals": trial.Q_normals}
         for column, layer in enumerate(chosen.values()):
             degrees[number, column] = trial.errors(layer(trial.P, trial.Q, **normals).target_from_source)[0]
-    cells = []
-    for found in degrees.T:
-        failed = int((found > FAILED_DEG).sum())
-        middle, high = np.quantile(found, (0.5, 0.9))
-        cells.append(f"{middle:.3f} / {high:.3f}" + f" ({failed})" * bool(failed))
-    return f"| {sampling} | {cell.name} | " + " | ".join(cells) + " |"
+    return f"| {sampling} | {cell.name} | " + " | ".join(map(spread, degrees.T)) + " |"
 
 
 def main() -> None:

@@ -17,6 +17,14 @@ TURNED_ROUND = 180.0  # degrees of error of an answer that is not finite
 
 
 SMALLEST = 1e-9  # degrees and data units: errors below are alike
+FAILED_DEG = 5.0  # an answer that is farther off has failed
+
+
+def spread(degrees: np.ndarray) -> str:
+    """Median / 90th percentile, and in brackets how many failed, where any did."""
+    middle, high = np.quantile(degrees, (0.5, 0.9))
+    failed = int((degrees > FAILED_DEG).sum())
+    return f"{middle:.3f} / {high:.3f}" + f" ({failed})" * bool(failed)
 
 
 class Scores(NamedTuple):

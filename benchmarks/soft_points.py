@@ -3,7 +3,7 @@
     python -m benchmarks.soft_points --repeats 20 --out benchmarks/soft_points.md
 
 The trials are those of ``benchmarks.paper``, disjoint sampling, with seeds from 1000 on, and those streets and rooms of
-``benchmarks.reliability_trials`` that have a thousand points or more, with draws that no confidence is fitted to.
+``benchmarks.reliability_trials`` that have a thousand points, with draws that no confidence is fitted to.
 """
 
 import argparse
@@ -18,14 +18,15 @@ import torch
 from bbr_layer import BBRLayer, Detached, atomic_write
 from bbr_layer.named_stages import default_stages
 from benchmarks.paper_experiments import EXPERIMENTS
+from benchmarks.paper_methods import by_layer
+from benchmarks.paper_results import FAILED_DEG
 from benchmarks.paper_trials import Trial
 from benchmarks.reliability_trials import clouds, trials
 
 SOFT_POINTS = (200, 300, 400, 500, 700, 1000)
 FIRST_SEED = 1000
 # Draws of streets and rooms: those before are what the confidence is fitted to.
-FIRST_DRAW, DRAWS, FEWEST_POINTS, WIDEST_DEG = 4, 12, 1000, 90.0
-FAILED_DEG = 5.0
+FIRST_DRAW, DRAWS, SCAN_POINTS, WIDEST_DEG = 4, 12, 1000, 90.0
 
 
 class Group(NamedTuple):
@@ -57,7 +58,7 @@ def trials_of(group: Group, repeats: int) -> Iterator[Trial]:
 
 def _scans() -> Iterator[Trial]:
     for trial in trials(DRAWS):
-        new = trial.seed >= FIRST_DRAW and trial.points == FEWEST_POINTS and trial.degrees <= WIDEST_DEG
+        new = trial.seed >= FIRST_DRAW and trial.points == SCAN_POINTS and trial.degrees <= WIDEST_DEG
         if new and trial.group in ("lidar", "indoor"):
             drawn = clouds(trial)
             yield Trial(drawn.P, drawn.Q, drawn.truth, drawn.P_normals, drawn.Q_normals)
@@ -75,11 +76,10 @@ def row(points: int, repeats: int) -> str:
 
 
 def _one(layer: BBRLayer, trial: Trial) -> tuple[float, float]:
-    normals = [None if x is None else x.float() for x in (trial.P_normals, trial.Q_normals)]
     before = time.process_time()
-    result = layer(trial.P.float(), trial.Q.float(), P_normals=normals[0], Q_normals=normals[1])
+    found = by_layer(layer, trial)
     seconds = time.process_time() - before
-    return trial.errors(result.target_from_source)[0], seconds
+    return trial.errors(found)[0], seconds
 
 
 def main() -> None:

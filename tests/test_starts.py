@@ -19,9 +19,9 @@ from bbr_layer import (
 )
 from bbr_layer.inner.adam import Adam
 from bbr_layer.losses import BuddyFilter
-from bbr_layer.named_stages import default_stages, named_stage
+from bbr_layer.named_stages import ALIKE_ITERATIONS, default_stages, named_stage
 from bbr_layer.preparation import prepared
-from bbr_layer.starts import HOT, TURN, best_start, most_starts, score, turns
+from bbr_layer.starts import AROUND_ITERATIONS, HOT, TURN, best_start, most_starts, score, turns
 from benchmarks.paper_experiments import EXPERIMENTS
 from benchmarks.reliability_trials import Trial, clouds
 
@@ -50,6 +50,7 @@ def test_an_easy_pair_is_registered_as_from_one_start():
     P, Q, _ = _turned(3, 20, 0)
     one, several = BBRLayer(backward=Detached())(P, Q), BBRLayer.robust(Detached())(P, Q)
     assert _error(several, one.target_from_source) < 0.01
+    assert several.iterations == AROUND_ITERATIONS + ALIKE_ITERATIONS < one.iterations
     stages = named_stage("softBBS"), named_stage("F")
     plain = [BBRLayer(*stages, backward=Detached(), starts=starts) for starts in (1, 7)]
     assert torch.equal(*(layer(P, Q).target_from_source.matrix for layer in plain))
@@ -188,10 +189,13 @@ def test_masked_points_and_weights_follow_their_item():
     torch.testing.assert_close(result.target_from_source.matrix, plain.target_from_source.matrix, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("points", [None, 60])
-def test_the_answer_is_the_same_with_and_without_a_gradient(points):
+def _two_stages(points):
+    return BBRLayer(named_stage("softBBS", points=points), named_stage("F", Adam(20, 0.005)), starts=7)
+
+
+@pytest.mark.parametrize("layer", [_two_stages(None), _two_stages(60), BBRLayer.robust()], ids=["all", "60", "robust"])
+def test_the_answer_is_the_same_with_and_without_a_gradient(layer):
     P, Q, _ = _turned(3, 90, 1)
-    layer = BBRLayer(named_stage("softBBS", points=points), named_stage("F", Adam(20, 0.005)), starts=7)
     with torch.no_grad():
         plain = layer(P, Q)
     kept = layer(P.clone().requires_grad_(), Q)
