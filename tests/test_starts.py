@@ -170,6 +170,16 @@ def test_a_start_without_a_score_is_not_chosen(monkeypatch):
     torch.testing.assert_close(found.motion.rotation[0], turns(3, 3)[2])
 
 
+@pytest.mark.parametrize(("other", "chosen"), [(1.04, 0), (1.06, 1)])
+def test_the_first_start_stays_where_another_is_hardly_better(other, chosen, monkeypatch):
+    P, Q, _ = _turned(3, 20, 0)
+    frame, pair = prepared(CloudPair(P[None], Q[None]), True, True)
+    scores = torch.tensor([1.0, other], dtype=torch.float64)
+    monkeypatch.setattr("bbr_layer.starts.score", lambda *_: scores)
+    found = best_start(2, [named_stage("F", Adam(2, 0.005))], (pair, frame), RigidMotion.identity(3, (1,)))
+    torch.testing.assert_close(found.motion.rotation[0], turns(2, 3)[chosen])
+
+
 def test_every_item_keeps_its_own_best():
     pairs = [_turned(3, 90, seed) for seed in (1, 2)]
     P, Q, truths = zip(*pairs, strict=True)
