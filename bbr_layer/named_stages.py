@@ -28,7 +28,8 @@ FIRST_STEPS, FIRST_RATE, FIRST_ROUNDING = 40, 0.01, 0.3
 # the rounding in point spacings with which Gauss-Newton ends on all points: benchmarks/planar.md.
 PLANAR_POINTS, PLANAR_ITERATIONS, PLANAR_ROUNDING = 64, 20, (0.3, 0.03)
 # Temperatures beyond which a pair hardly pulls in F: at the end 1.5 point spacings of Eq. 7, which adds two normals.
-# Measured: a sixth to a half less error beside a distractor, about the same on whole models; benchmarks/reach.md.
+# Measured, benchmarks/reach.md: a seventh to a third less error beside a distractor, a tenth to a fifth more in partial
+# overlap, either on whole models.
 REACH = 50.0
 # Steps of that, and their rate: in space Gauss-Newton ends it, which is where the derivative converges. Chosen.
 REACH_STEPS, REACH_RATE = 100, 0.01
