@@ -107,6 +107,18 @@ def test_a_training_that_only_harms_ends_at_its_start():
     assert trained.curves[SCORE][-1] == trained.curves[SCORE][0], "the settling phase moved poses"
 
 
+def test_the_last_epoch_is_kept_where_that_is_asked_for():
+    scans = small_world()
+    harmful = {"term": "chamfer", "localisation_rate": 1.0, "warm_up": 0, "settle": 0.5, "adjust": False}
+    start = true_poses(scans)
+    trained = train_map(scans, true_edges(scans), start, small_config(epochs=6, keep="last", **harmful))
+    assert trained.kept_epoch == 6
+    assert not torch.equal(trained.world_from_scan.matrix, start.matrix)
+    moved = trained.curves[SCORE]
+    assert moved[-1] > 1.2 * moved[0]
+    assert moved[3:] == [moved[3]] * 4, "the settling phase moved poses"
+
+
 def test_no_epochs_keep_the_start(tmp_path):
     scans = small_world()
     start = displaced(true_poses(scans), 0.1)

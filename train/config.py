@@ -57,6 +57,8 @@ class TrainingConfig(Settings):
     term: registration term, one of ``TERMS``.
     epochs: passes over all edges; 0 keeps the edges' map.
     adjust: begin at the poses at which the map of all scans is thinnest, where the score agrees.
+    keep: "best", the poses that align held-out points best, the starting ones included; "last", where the training
+        ends, better or not: to compare registration terms.
     warm_up, settle: shares of the epochs, at the beginning and at the end, in which only the occupancy network
         learns: first the starting map, before it may move a pose; at last the map of the poses that were kept.
     group: consecutive scans in one step; the partners of their loop edges come on top.
@@ -74,6 +76,7 @@ class TrainingConfig(Settings):
     term: str = "F"
     epochs: Annotated[int, Field(ge=0)] = 40
     adjust: bool = True
+    keep: Literal["best", "last"] = "best"
     warm_up: Share = 0.2
     settle: Share = 0.2
     group: Annotated[int, Field(ge=2)] = 8

@@ -13,8 +13,8 @@ from train.scans import Progress
 
 # The name under which the score is logged and kept.
 SCORE = "alignment"
-# By how much a later epoch must be better. The held-out points are a sample: between poses that are equally far from
-# the truth the score differs by about 1e-4.
+# By how much a later epoch must be better by default. The held-out points are a sample: between poses that are equally
+# far from the truth the score differs by about 1e-4.
 MARGIN = 5e-4
 
 
@@ -22,16 +22,17 @@ class KeepBest(L.Callback):
     """Score the poses before the training and after every epoch, and go back to the best ones for the settling phase.
 
     Epoch 0 is the starting map, epoch e the poses after e epochs. A later epoch must be better
-    by ``MARGIN``. All of it lies in the checkpoints, so that a resumed run has the same history and best poses.
+    by ``margin``. All of it lies in the checkpoints, so that a resumed run has the same history and best poses.
 
     Parameters
     ----------
     alignment: the score, lower is better.
     data: what poses are read from.
+    margin: by how much a later epoch must be better. Default ``MARGIN``; minus infinity: the last epoch is kept.
     """
 
-    def __init__(self, alignment: Callable[[RigidMotion], float], data: MappingData):
-        self.alignment, self.data = alignment, data
+    def __init__(self, alignment: Callable[[RigidMotion], float], data: MappingData, margin: float = MARGIN):
+        self.alignment, self.data, self.margin = alignment, data, margin
         self.kept_epoch = 0
         self.kept: dict[str, Tensor] | None = None
         self.curves: dict[str, list[float]] = {}
@@ -49,7 +50,7 @@ class KeepBest(L.Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         module, epoch = _mapping(pl_module), trainer.current_epoch
         score = self.alignment(module.poses(self.data.every_scan()))
-        if score < self.curves[SCORE][self.kept_epoch] - MARGIN:
+        if score < self.curves[SCORE][self.kept_epoch] - self.margin:
             self.kept_epoch = epoch + 1
             self.kept = copy.deepcopy(module.model.localisation.state_dict())
         self.curves[SCORE].append(score)

@@ -1,5 +1,6 @@
 """Training the map with Lightning: from scans, edges and starting poses to corrected poses and an occupancy network."""
 
+import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from bbr_layer import RigidMotion
 from train.alignment import Alignment
 from train.config import MapConfig
 from train.data_module import MappingData
-from train.keep_best import KeepBest, ReportProgress
+from train.keep_best import MARGIN, KeepBest, ReportProgress
 from train.mapping_module import MappingModule, build_module
 from train.pose_graph import Edges
 from train.scans import Progress, ScanSet, silent
@@ -51,7 +52,7 @@ def train_map(
     progress: Progress = silent,
     fast_dev_run: bool = False,
 ) -> Trained:
-    """Correct the poses so that one occupancy map explains all scans, and never end worse than the start.
+    """Correct the poses so that one occupancy map explains all scans, and never end worse than the start by default.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def train_map(
     score = MapScore(Alignment(data.prepared, edges), SurfaceMap(scans, data.prepared, start.matrix.double().numpy()))
     if config.training.adjust:
         data.start = score.adjusted(data.start, progress)
-    best = KeepBest(score, data)
+    best = KeepBest(score, data, MARGIN if config.training.keep == "best" else -math.inf)
     trainer = L.Trainer(
         accelerator=config.device,
         devices=1,
