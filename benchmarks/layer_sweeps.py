@@ -10,7 +10,8 @@ import torch
 
 from bbr_layer.kernels import cpu
 from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, room_to_keep
-from bbr_layer.kernels.cpu_math import FAST, exp_negative, wide_vectors
+from bbr_layer.kernels.cpu_compiling import FAST
+from bbr_layer.kernels.cpu_math import exp_negative, wide_vectors
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 from bbr_layer.pair import CloudPair
 from benchmarks.layer_problems import clouds

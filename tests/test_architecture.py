@@ -17,6 +17,7 @@ ORDER = {
         geometry
         embedding pair trees tiles
         kernels
+        kernels.cpu_compiling
         kernels.cpu_math
         kernels.cpu_walk kernels.cpu_turns kernels.cpu_axes
         kernels.cpu_adam kernels.cpu_mutual

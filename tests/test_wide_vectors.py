@@ -5,7 +5,7 @@ import pytest
 llvm = pytest.importorskip("llvmlite.binding", reason="the compiled sweeps need numba and its llvmlite")
 numba = pytest.importorskip("numba", reason="the compiled sweeps need numba")
 from bbr_layer.kernels import cpu_dual, cpu_dual_forces, cpu_dual_planes, cpu_forces, cpu_sweeps  # noqa: E402
-from bbr_layer.kernels.cpu_math import FAST  # noqa: E402
+from bbr_layer.kernels.cpu_compiling import FAST  # noqa: E402
 
 HAS_512 = llvm.get_host_cpu_features().get("avx512f", False)
 SWEEPS = [

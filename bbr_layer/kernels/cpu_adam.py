@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_math import exact
+from bbr_layer.kernels.cpu_compiling import exact, exact_part
 from bbr_layer.kernels.cpu_turns import apply_transposed, axial, exponential, product, through_exponential
 
 
@@ -53,7 +53,7 @@ class Back(NamedTuple):
     second: np.ndarray
 
 
-@exact
+@exact_part
 def _mean_in_blocks(values, free, shared):  # type: ignore[no-untyped-def]
     """The mean over the free components of rotation and of translation, in place; as they are unless ``shared``."""
     for k in range(6):
@@ -66,7 +66,7 @@ def _mean_in_blocks(values, free, shared):  # type: ignore[no-untyped-def]
                 values[k] = free[k] * total / count
 
 
-@exact
+@exact_part
 def _direction(first, second, constants, number):  # type: ignore[no-untyped-def]
     """The direction of step ``number`` and the root of the unbiased second moment; 0 where nothing has moved yet."""
     fast, slow, eps = constants
@@ -78,23 +78,31 @@ def _direction(first, second, constants, number):  # type: ignore[no-untyped-def
     return direction, roots
 
 
+@exact_part
+def _turn(rates, direction):  # type: ignore[no-untyped-def]
+    """The rotation vector of a move."""
+    return -rates[0] * direction[0], -rates[1] * direction[1], -rates[2] * direction[2]
+
+
+# Loops instead of expressions of arrays: compiling those takes seconds more, most of them for the words of errors.
 @exact
 def advance(course, trace, step):  # type: ignore[no-untyped-def]
     """From point ``step`` of the trace, along the gradient there, to the next point."""
     fast, slow, _ = course.constants
     gradient, first, second = trace.gradients[step], trace.firsts[step + 1], trace.seconds[step + 1]
-    squares = gradient**2
+    squares = np.empty(6)
+    for k in range(6):
+        squares[k] = gradient[k] * gradient[k]
     _mean_in_blocks(squares, course.free, course.shared)
     for k in range(6):
         gradient[k] *= course.free[k]
         first[k] = fast * trace.firsts[step, k] + (1 - fast) * gradient[k]
         second[k] = slow * trace.seconds[step, k] + (1 - slow) * squares[k]
     direction, _ = _direction(first, second, course.constants, course.done + step + 1)
-    move = -course.rates[step] * direction
-    turn = exponential((move[0], move[1], move[2]))
+    turn = exponential(_turn(course.rates[step], direction))
     trace.rotations[step + 1] = product(turn, trace.rotations[step])
     for k in range(3):
-        trace.translations[step + 1, k] = trace.translations[step, k] + move[3 + k]
+        trace.translations[step + 1, k] = trace.translations[step, k] - course.rates[step, 3 + k] * direction[3 + k]
 
 
 @exact
@@ -106,15 +114,15 @@ def retreat(course, trace, step, back, by_rates):  # type: ignore[no-untyped-def
     (fast, slow, eps), number = course.constants, course.done + step + 1
     second, gradient = trace.seconds[step + 1], trace.gradients[step]
     direction, roots = _direction(trace.firsts[step + 1], second, course.constants, number)
-    move = -course.rates[step] * direction
-    vector = move[0], move[1], move[2]
+    vector = _turn(course.rates[step], direction)
     torque = axial(product(back.rotation, trace.rotations[step + 1].T))
-    by_move = np.zeros(6)
+    by_move, by_second, by_gradient = np.zeros(6), np.zeros(6), np.zeros(6)
     by_move[0], by_move[1], by_move[2] = through_exponential(vector, torque)
-    by_move[3:] = back.translation
-    by_move *= course.free
-    by_second, by_gradient = back.second.copy(), np.zeros(6)
+    for k in range(3):
+        by_move[3 + k] = back.translation[k]
     for k in range(6):
+        by_move[k] *= course.free[k]
+        by_second[k] = back.second[k]
         by_rates[step, k] = -direction[k] * by_move[k]
         by_first = back.first[k]
         if second[k] > 0:
@@ -124,9 +132,10 @@ def retreat(course, trace, step, back, by_rates):  # type: ignore[no-untyped-def
         by_gradient[k] = (1 - fast) * by_first
         back.first[k], back.second[k] = fast * by_first, slow * by_second[k]
     _mean_in_blocks(by_second, course.free, course.shared)
-    by_gradient += 2 * (1 - slow) * gradient * by_second
+    for k in range(6):
+        by_gradient[k] = course.free[k] * (by_gradient[k] + 2 * (1 - slow) * gradient[k] * by_second[k])
     turn = exponential(vector)
     for column in range(3):
         rotation = back.rotation[:, column]
-        rotation[:] = apply_transposed(turn, (rotation[0], rotation[1], rotation[2]))
-    return by_gradient * course.free
+        rotation[0], rotation[1], rotation[2] = apply_transposed(turn, (rotation[0], rotation[1], rotation[2]))
+    return by_gradient

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_math import exact
+from bbr_layer.kernels.cpu_compiling import exact, exact_part
 
 # Rounds of Jacobi's three rotations. They converge quadratically: five leave off-diagonals of 1e-16 of the largest.
 ROUNDS = 6
 
 
-@exact
+@exact_part
 def _covariance(points, rows, into):  # type: ignore[no-untyped-def]
     """Mean outer product of the offsets of ``points[rows]`` from their mean, ``(3, 3)``."""
     centre, offset = np.zeros(3), np.empty(3)
@@ -24,7 +24,7 @@ def _covariance(points, rows, into):  # type: ignore[no-untyped-def]
                 into[a, b] += offset[a] * offset[b] / len(rows)
 
 
-@exact
+@exact_part
 def _diagonalise(matrix, vectors):  # type: ignore[no-untyped-def]
     """Turn a symmetric ``(3, 3)`` into its eigenvalues on the diagonal, ``vectors`` into its eigenvectors by column.
 
@@ -53,6 +53,18 @@ def _diagonalise(matrix, vectors):  # type: ignore[no-untyped-def]
                     vectors[k, p], vectors[k, q] = cosine * left - sine * right, sine * left + cosine * right
 
 
+@exact_part
+def _rising(matrix):  # type: ignore[no-untyped-def]
+    """Where on the diagonal the least, the middle and the greatest number stand."""
+    least = greatest = 0
+    for a in range(1, 3):
+        if matrix[a, a] < matrix[least, least]:
+            least = a
+        if matrix[a, a] >= matrix[greatest, greatest]:
+            greatest = a
+    return least, 3 - least - greatest, greatest
+
+
 @exact
 def axes(points, index, variances, vectors):  # type: ignore[no-untyped-def]
     """Of every row of ``index (n, k)`` the variances ``(n, 3)``, least first, along ``vectors (n, 3, 3)`` by column."""
@@ -60,7 +72,7 @@ def axes(points, index, variances, vectors):  # type: ignore[no-untyped-def]
     for i in range(len(index)):
         _covariance(points, index[i], matrix)
         _diagonalise(matrix, turned)
-        order = np.argsort(np.array([matrix[0, 0], matrix[1, 1], matrix[2, 2]]))
+        order = _rising(matrix)
         for a in range(3):
             variances[i, a] = matrix[order[a], order[a]]
             for k in range(3):

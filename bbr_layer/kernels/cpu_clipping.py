@@ -10,7 +10,8 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from bbr_layer.kernels.cpu_math import ALIGN, ZERO, compiled, wide_vectors
+from bbr_layer.kernels.cpu_compiling import compiled
+from bbr_layer.kernels.cpu_math import ALIGN, ZERO, wide_vectors
 from bbr_layer.kernels.cpu_pairs import plane, point_of, three
 
 

@@ -6,6 +6,7 @@ its rate of change behind it, and what is kept goes on with the rates of the dis
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_compiling import compiled, compiled_part
 from bbr_layer.kernels.cpu_limits import limit_of
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
@@ -20,7 +21,6 @@ from bbr_layer.kernels.cpu_math import (
     VELOCITY,
     WEIGHT,
     ZERO,
-    compiled,
     share_of,
     wide_vectors,
 )
@@ -81,7 +81,7 @@ def denominator_rates(sides, normals, out, constants, kept):  # type: ignore[no-
         add_up(out[1], sums)
 
 
-@compiled(forceinline=True)
+@compiled_part(forceinline=True)
 def weights_of(rows, i):  # type: ignore[no-untyped-def]
     """Weight, inverse denominator and its rate of row ``i``."""
     return rows[WEIGHT, i], rows[INVERSE, i], rows[INVERSE_RATE, i]

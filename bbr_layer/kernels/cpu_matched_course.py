@@ -3,13 +3,13 @@
 import numpy as np
 
 from bbr_layer.kernels.cpu_adam import advance, retreat
+from bbr_layer.kernels.cpu_compiling import exact, exact_part
 from bbr_layer.kernels.cpu_matched import slope_of
 from bbr_layer.kernels.cpu_matched_adjoint import add_adjoint, add_weights
-from bbr_layer.kernels.cpu_math import exact
 from bbr_layer.kernels.cpu_mutual import mutual_pairs
 
 
-@exact
+@exact_part
 def _pairs(search, pose, index, mutual, counts):  # type: ignore[no-untyped-def]
     """The pairs at a pose into ``index`` and ``mutual``, in the rows of the clouds; ``counts (2, 3)`` grow.
 
@@ -35,7 +35,9 @@ def walk(clouds, search, course, trace):  # type: ignore[no-untyped-def]
     for step in range(len(course.temperatures)):
         pose = trace.rotations[step], trace.translations[step]
         _pairs(search, pose, index, mutual, counts)
-        trace.gradients[step] = slope_of(clouds, (index, mutual), pose, course.temperatures[step])
+        slope = slope_of(clouds, (index, mutual), pose, course.temperatures[step])
+        for k in range(len(slope)):
+            trace.gradients[step, k] = slope[k]
         advance(course, trace, step)
     return counts
 

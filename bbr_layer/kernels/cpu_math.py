@@ -1,17 +1,16 @@
-"""Arithmetic of the compiled sweeps: how they are compiled, a vectorised exponential, and the channels they read."""
+"""Arithmetic of the compiled sweeps: a vectorised exponential, and the channels they read."""
 
 import inspect
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic, overload
 
-# Reassociation lets sums run in vector registers; infinities and NaN never enter, inputs are checked at the door.
-FAST = {"nnan", "ninf", "nsz", "contract", "arcp", "reassoc", "afn"}
+from bbr_layer.kernels.cpu_compiling import FAST
+
 # Columns that a row is compared with at a time: a dozen arrays of this many float32 stay in a 64 KiB cache.
 TILE = 1024
 # Rows whose sums over columns are added up in the points' own precision, before they go on in float64.
@@ -42,20 +41,6 @@ EXP2 = tuple(F32(math.log(2) ** k / math.factorial(k)) for k in range(7))
 LOWEST_EXPONENT, EXPONENT_BIAS, MANTISSA_BITS = F32(-116.0), np.int32(127), np.int32(23)
 FAINT = F32(2.0**-60)
 HALF, ZERO, ONE, TWO = F32(0.5), F32(0.0), F32(1.0), F32(2.0)
-
-
-def compiled(**more: Any) -> Callable[[Callable], Callable]:
-    """Numba's decorator with the options of all sweeps; results are cached on disk.
-
-    Whatever wraps a function, as checks of its arguments do, is taken off first: Numba compiles what was written.
-    """
-    decorate = njit(fastmath=FAST, error_model="numpy", cache=True, nogil=True, **more)
-    return lambda function: decorate(inspect.unwrap(function))
-
-
-def exact(function: Callable) -> Callable:
-    """Numba's decorator without fast arithmetic, for what is not a sweep."""
-    return njit(error_model="numpy", cache=True, nogil=True)(inspect.unwrap(function))
 
 
 def _float_of_bits(typing_context, bits):  # type: ignore[no-untyped-def]

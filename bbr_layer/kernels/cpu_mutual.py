@@ -8,7 +8,7 @@ nearer, the reach of the list proves the champion to be the nearest, or the whol
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_math import exact
+from bbr_layer.kernels.cpu_compiling import exact, exact_part
 from bbr_layer.kernels.cpu_walk import UNKNOWN, look_up, placed, refresh_all, remember, squared_distance
 from bbr_layer.trees import ROUNDING
 
@@ -29,7 +29,7 @@ def champions(index, distance, count):  # type: ignore[no-untyped-def]
     return champion, nearest
 
 
-@exact
+@exact_part
 def _denied(lists, rival, place, squared):  # type: ignore[no-untyped-def]
     """A listed point that is nearer than the rival, or -1 and the least squared distance of the others."""
     x, y, z = place
@@ -45,7 +45,7 @@ def _denied(lists, rival, place, squared):  # type: ignore[no-untyped-def]
     return -1, second
 
 
-@exact
+@exact_part
 def contest(lists, moving, pose, held, memory):  # type: ignore[no-untyped-def]
     """Bring the memory of chosen points up to date: the champion where it is the nearest, else any nearer one.
 
@@ -98,6 +98,17 @@ def agreeing(index, back):  # type: ignore[no-untyped-def]
     return mutual
 
 
+@exact_part
+def _reversed(pose):  # type: ignore[no-untyped-def]
+    rotation, translation = pose
+    turned, shift = np.empty((3, 3)), np.empty(3)
+    for a in range(3):
+        for b in range(3):
+            turned[a, b] = rotation[b, a]
+        shift[a] = -(turned[a, 0] * translation[0] + turned[a, 1] * translation[1] + turned[a, 2] * translation[2])
+    return turned, shift
+
+
 @exact
 def mutual_pairs(forth, back, pose):  # type: ignore[no-untyped-def]
     """Which choices of the moved points are mutual, and of each side how many were asked, searched for and looked up.
@@ -108,9 +119,7 @@ def mutual_pairs(forth, back, pose):  # type: ignore[no-untyped-def]
     ----------
     forth, back: (lists, moving, wanted, memory) of the source in the target, of the target in the source.
     """
-    rotation, translation = pose
-    turned = np.ascontiguousarray(rotation.T)
-    reverse = turned, -(turned @ translation)
+    reverse = _reversed(pose)
     first = refresh_all(forth[0], forth[1], pose, forth[2], forth[3])
     index, (lists, moving, _, memory) = forth[3].found, back
     held = champions(index, forth[3].distance, len(moving))

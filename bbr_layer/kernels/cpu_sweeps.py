@@ -8,20 +8,9 @@ each computes its own). The innermost loops run over plain slices, in which LLVM
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_limits import limit_of
-from bbr_layer.kernels.cpu_math import (
-    ALIGN,
-    CHUNK,
-    COOL,
-    INVERSE,
-    SMOOTH,
-    TILE,
-    WEIGHT,
-    ZERO,
-    compiled,
-    share_of,
-    wide_vectors,
-)
+from bbr_layer.kernels.cpu_math import ALIGN, CHUNK, COOL, INVERSE, SMOOTH, TILE, WEIGHT, ZERO, share_of, wide_vectors
 from bbr_layer.kernels.cpu_pairs import add_up, dot, kept_row, measured, plane_square, point_of, three
 
 
