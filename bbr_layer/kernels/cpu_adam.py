@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import exact, exact_part
+from bbr_layer.kernels.cpu_compiling import exact
 from bbr_layer.kernels.cpu_turns import apply_transposed, axial, exponential, product, through_exponential
 
 
@@ -53,7 +53,7 @@ class Back(NamedTuple):
     second: np.ndarray
 
 
-@exact_part
+@exact
 def _mean_in_blocks(values, free, shared):  # type: ignore[no-untyped-def]
     """The mean over the free components of rotation and of translation, in place; as they are unless ``shared``."""
     for k in range(6):
@@ -66,7 +66,7 @@ def _mean_in_blocks(values, free, shared):  # type: ignore[no-untyped-def]
                 values[k] = free[k] * total / count
 
 
-@exact_part
+@exact
 def _direction(first, second, constants, number):  # type: ignore[no-untyped-def]
     """The direction of step ``number`` and the root of the unbiased second moment; 0 where nothing has moved yet."""
     fast, slow, eps = constants
@@ -78,7 +78,7 @@ def _direction(first, second, constants, number):  # type: ignore[no-untyped-def
     return direction, roots
 
 
-@exact_part
+@exact
 def _turn(rates, direction):  # type: ignore[no-untyped-def]
     """The rotation vector of a move."""
     return -rates[0] * direction[0], -rates[1] * direction[1], -rates[2] * direction[2]

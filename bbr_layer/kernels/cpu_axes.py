@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import exact, exact_part
+from bbr_layer.kernels.cpu_compiling import exact
 
 # Rounds of Jacobi's three rotations. They converge quadratically: five leave off-diagonals of 1e-16 of the largest.
 ROUNDS = 6
 
 
-@exact_part
+@exact
 def _covariance(points, rows, into):  # type: ignore[no-untyped-def]
     """Mean outer product of the offsets of ``points[rows]`` from their mean, ``(3, 3)``."""
     centre, offset = np.zeros(3), np.empty(3)
@@ -24,7 +24,7 @@ def _covariance(points, rows, into):  # type: ignore[no-untyped-def]
                 into[a, b] += offset[a] * offset[b] / len(rows)
 
 
-@exact_part
+@exact
 def _diagonalise(matrix, vectors):  # type: ignore[no-untyped-def]
     """Turn a symmetric ``(3, 3)`` into its eigenvalues on the diagonal, ``vectors`` into its eigenvectors by column.
 
@@ -53,7 +53,7 @@ def _diagonalise(matrix, vectors):  # type: ignore[no-untyped-def]
                     vectors[k, p], vectors[k, q] = cosine * left - sine * right, sine * left + cosine * right
 
 
-@exact_part
+@exact
 def _rising(matrix):  # type: ignore[no-untyped-def]
     """Where on the diagonal the least, the middle and the greatest number stand."""
     least = greatest = 0

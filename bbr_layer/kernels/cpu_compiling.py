@@ -12,8 +12,6 @@ from numba.core.event import Event, Listener, register
 LOGGER = logging.getLogger("bbr_layer")
 # Reassociation lets sums run in vector registers; infinities and NaN never enter, inputs are checked at the door.
 FAST = {"nnan", "ninf", "nsz", "contract", "arcp", "reassoc", "afn"}
-# Without the door from Python a small function is compiled in less time.
-PART: dict[str, Any] = {"no_cpython_wrapper": True}
 
 
 def cacheable() -> bool:
@@ -40,19 +38,9 @@ def compiled(**more: Any) -> Callable[[Callable], Callable]:
     return lambda function: decorate(inspect.unwrap(function))
 
 
-def compiled_part(**more: Any) -> Callable[[Callable], Callable]:
-    """``compiled`` for what only other compiled functions call."""
-    return compiled(**PART, **more)
-
-
 def exact(function: Callable) -> Callable:
     """Numba's decorator without fast arithmetic, for what is not a sweep."""
     return njit(**COMMON)(inspect.unwrap(function))
-
-
-def exact_part(function: Callable) -> Callable:
-    """``exact`` for what only other compiled functions call."""
-    return njit(**COMMON, **PART)(inspect.unwrap(function))
 
 
 class Told(Listener):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bbr_layer.kernels.cpu_adam import advance, retreat
-from bbr_layer.kernels.cpu_compiling import exact, exact_part
+from bbr_layer.kernels.cpu_compiling import exact
 from bbr_layer.kernels.cpu_items import Loss, Tables, item_gradient, item_rates
 from bbr_layer.kernels.cpu_math import COLUMN_OUT, COOL, HEAT, ROUND, ROW_OUT, VELOCITY
 from bbr_layer.kernels.cpu_turns import apply, apply_transposed, cross
@@ -52,13 +52,13 @@ class Adjoint(NamedTuple):
     rounding: np.ndarray
 
 
-@exact_part
+@exact
 def at(table, j):  # type: ignore[no-untyped-def]
     """Column ``j`` of three channels."""
     return table[0, j], table[1, j], table[2, j]
 
 
-@exact_part
+@exact
 def place(cloud, columns, normals, pose):  # type: ignore[no-untyped-def]
     """Put the columns, and their normals unless None, where the pose has them."""
     rotation, shift = pose
@@ -103,7 +103,7 @@ def set_going(cloud, columns, normals, pose, along):  # type: ignore[no-untyped-
                     normals[1][3 + k, j] = spin[k]
 
 
-@exact_part
+@exact
 def _pulled(cloud, sums, channel, j, moved):  # type: ignore[no-untyped-def]
     """Rate of the force in ``channel`` on column ``j``, as seen from the turning frame, into rotation and own frame."""
     turn, rotation, by_rotation, own, table = moved

@@ -6,7 +6,7 @@ its rate of change behind it, and what is kept goes on with the rates of the dis
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import compiled, compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_limits import limit_of
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
@@ -81,7 +81,7 @@ def denominator_rates(sides, normals, out, constants, kept):  # type: ignore[no-
         add_up(out[1], sums)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def weights_of(rows, i):  # type: ignore[no-untyped-def]
     """Weight, inverse denominator and its rate of row ``i``."""
     return rows[WEIGHT, i], rows[INVERSE, i], rows[INVERSE_RATE, i]

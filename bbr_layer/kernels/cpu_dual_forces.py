@@ -5,7 +5,7 @@ What ``cpu_sweeps`` sums in channel c is here in c, and its rate ``ROW_OUT`` or 
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_math import (
     BY_M,
     BY_M_RATE,
@@ -45,20 +45,20 @@ from bbr_layer.kernels.cpu_pairs import (
 )
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def loss_rates(constants):  # type: ignore[no-untyped-def]
     """What ``slope_rate`` calls ``loss``."""
     values = constants[COOL], constants[BY_S], constants[BY_M]
     return values + (constants[COOL_RATE], constants[BY_S_RATE], constants[BY_M_RATE])
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def row_rates(rows, i):  # type: ignore[no-untyped-def]
     """What ``slope_rate`` calls ``row``."""
     return rows[WEIGHT, i], rows[INVERSE, i], rows[SHARE, i], rows[INVERSE_RATE, i], rows[SHARE_RATE, i]
 
 
-@compiled_part()
+@compiled()
 def point_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """``point_forces`` and their rates."""
     wide_vectors()
@@ -102,7 +102,7 @@ def point_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-
         add_up(out[1], sums)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def add_sums(out, i, sums, rates):  # type: ignore[no-untyped-def]
     """Add to the sums for temperature and rounding, and to their rates."""
     out[HEAT, i] += sums[0]

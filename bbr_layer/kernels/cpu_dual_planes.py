@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import compiled, compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_dual_forces import add_sums, loss_rates, point_force_rates, row_rates
 from bbr_layer.kernels.cpu_limits import clipped, if_free, limit_of
 from bbr_layer.kernels.cpu_math import (
@@ -35,7 +35,7 @@ from bbr_layer.kernels.cpu_pairs import (
 )
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def pushes(offsets, normals, scales, others, limit):  # type: ignore[no-untyped-def]
     """Of one pair (point to plane): sign, force along the normals and its rate, the two sums, and their rates.
 
@@ -63,7 +63,7 @@ def pushes(offsets, normals, scales, others, limit):  # type: ignore[no-untyped-
     )
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def add_products(out, row, vectors, pushed, signs):  # type: ignore[no-untyped-def]
     """Add ``push * vector`` to the columns and, times the sign, to the row; and its rate, by the product rule.
 
@@ -90,7 +90,7 @@ def add_products(out, row, vectors, pushed, signs):  # type: ignore[no-untyped-d
     return (ax, ay, az), (bx, by, bz)
 
 
-@compiled_part()
+@compiled()
 def plane_force_rates(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """``plane_forces`` and their rates, nothing kept used: what each pair pushes, points and normals."""
     wide_vectors()

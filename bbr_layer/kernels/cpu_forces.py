@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import compiled, compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_limits import clipped, if_free, limit_of
 from bbr_layer.kernels.cpu_math import (
     ALIGN,
@@ -35,7 +35,7 @@ from bbr_layer.kernels.cpu_pairs import (
 )
 
 
-@compiled_part()
+@compiled()
 def point_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """The gradient of a point-to-point loss: the force on each row and column, channels 0 to 2 of both ``out``.
 
@@ -74,7 +74,7 @@ def point_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyp
         add_up(out[1], sums)
 
 
-@compiled_part()
+@compiled()
 def plane_forces(sides, normals, out, constants, kept):  # type: ignore[no-untyped-def]
     """The gradient of a point-to-plane loss: as ``point_forces``, and the derivatives by normals in channels 3 to 5."""
     wide_vectors()

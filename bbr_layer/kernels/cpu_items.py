@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bbr_layer.kernels.cpu_clipping import settle_limit
-from bbr_layer.kernels.cpu_compiling import compiled, compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
 from bbr_layer.kernels.cpu_dual_planes import force_rates
 from bbr_layer.kernels.cpu_forces import forces
@@ -53,7 +53,7 @@ class Tables(NamedTuple):
     constants: np.ndarray
 
 
-@compiled_part()
+@compiled()
 def invert(side, sums, outlier, rates):  # type: ignore[no-untyped-def]
     """Inverse denominators of Eq. 4 and, if asked, their relative rates, from sums ``(channels, points)``."""
     for i in range(side.shape[1]):
@@ -63,7 +63,7 @@ def invert(side, sums, outlier, rates):  # type: ignore[no-untyped-def]
             side[INVERSE_RATE, i] = sums[1, i] / total
 
 
-@compiled_part()
+@compiled()
 def weighted_total(side, sums, channel):  # type: ignore[no-untyped-def]
     """The sum over all points of one channel times their weight."""
     total = 0.0
@@ -72,7 +72,7 @@ def weighted_total(side, sums, channel):  # type: ignore[no-untyped-def]
     return total
 
 
-@compiled_part()
+@compiled()
 def settle_loss(rows, sums, constants, mean, rates):  # type: ignore[no-untyped-def]
     """The loss from S and M; its derivatives by both, and their rates, go into the constants (``loss_of_sums``)."""
     S, M = weighted_total(rows, sums, 0), weighted_total(rows, sums, 1)
@@ -92,7 +92,7 @@ def settle_loss(rows, sums, constants, mean, rates):  # type: ignore[no-untyped-
     return loss
 
 
-@compiled_part()
+@compiled()
 def settle_shares(side, sums, constants, shares, rates):  # type: ignore[no-untyped-def]
     """The loss per unit of weight of each point (and its rate) into ``shares``, times the weight into ``side``."""
     for i in range(side.shape[1]):
@@ -106,7 +106,7 @@ def settle_shares(side, sums, constants, shares, rates):  # type: ignore[no-unty
             side[SHARE_RATE, i] = change * side[WEIGHT, i]
 
 
-@compiled_part()
+@compiled()
 def cleared(tables):  # type: ignore[no-untyped-def]
     """Two tables of sums, set to 0."""
     tables[0][:] = 0

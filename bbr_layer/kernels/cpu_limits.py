@@ -5,7 +5,7 @@ from typing import Any
 from numba import types
 from numba.extending import overload
 
-from bbr_layer.kernels.cpu_compiling import compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_math import ZERO
 
 
@@ -21,13 +21,13 @@ def _limit_of(normals):  # type: ignore[no-untyped-def]
     return lambda normals: normals[2][0]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def clipped(squared, limit):  # type: ignore[no-untyped-def]
     """A square, at most the limit unless that is None."""
     return squared if limit is None else min(squared, limit)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def if_free(value, squared, limit):  # type: ignore[no-untyped-def]
     """The value; 0 where the square is clipped."""
     return value if limit is None else (value if squared < limit else ZERO)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import compiled, compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_turns import apply, cross
 from bbr_layer.kernels.likeness import NORMALS_APART, POINTS_APART
 from bbr_layer.pair import CloudPair
@@ -44,7 +44,7 @@ def matched_clouds(pair: CloudPair, reach: float, alike: bool = False) -> list[M
     return [MatchedClouds._make((*item[:-1], 1 / reach, float(item[-1]))) for item in items]
 
 
-@compiled_part()
+@compiled()
 def scale_of(clouds, index, mutual):  # type: ignore[no-untyped-def]
     """One over the weight of all mutual pairs; 0 without any."""
     total = 0.0
@@ -54,23 +54,23 @@ def scale_of(clouds, index, mutual):  # type: ignore[no-untyped-def]
     return 1 / total if total > 0 else 0.0
 
 
-@compiled_part()
+@compiled()
 def _carry(matrix, table, row):  # type: ignore[no-untyped-def]
     return apply(matrix, (table[row, 0], table[row, 1], table[row, 2]))
 
 
-@compiled_part()
+@compiled()
 def dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled_part()
+@compiled()
 def combined(s, a, t, b):  # type: ignore[no-untyped-def]
     """``s a + t b``."""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
 
-@compiled_part()
+@compiled()
 def place_of(clouds, i, j, pose):  # type: ignore[no-untyped-def]
     """A pair in the target's frame: arm, turned normal, offset from P to the moved Q, n_q + s n_p, and s."""
     rotation, shift = pose
@@ -81,13 +81,13 @@ def place_of(clouds, i, j, pose):  # type: ignore[no-untyped-def]
     return arm, turned, offset, combined(1.0, turned, sign, facing), sign
 
 
-@compiled_part()
+@compiled()
 def steepness_of(flat, temperature, rounded):  # type: ignore[no-untyped-def]
     """``u = 1 / (1 + d / (reach * temperature))``: a rounded distance d counts as d u, and its slope is u squared."""
     return 1 / (1 + rounded * flat / temperature) if flat > 0 else 1.0
 
 
-@compiled_part()
+@compiled()
 def _likeness(near, offset, normals):  # type: ignore[no-untyped-def]
     """As ``likeness.likeness``; 1 where all pairs count alike."""
     if near == 0:
@@ -95,7 +95,7 @@ def _likeness(near, offset, normals):  # type: ignore[no-untyped-def]
     return NORMALS_APART / ((1 + near * dot(offset, offset)) * (1 - abs(dot(normals[0], normals[1])) + NORMALS_APART))
 
 
-@compiled_part()
+@compiled()
 def _pull(clouds, pairs, j, placing):  # type: ignore[no-untyped-def]
     """How much a pair pulls per unit of its residual, the residual, and its derivative by a turn and by a shift.
 

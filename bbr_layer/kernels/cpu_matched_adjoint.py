@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import compiled, compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_matched import combined, dot, place_of, scale_of, steepness_of
 from bbr_layer.kernels.cpu_turns import cross
 
 
-@compiled_part()
+@compiled()
 def _rates(placed, counted, temperature, along):  # type: ignore[no-untyped-def]
     """How a pair's force and torque change along ``(turn, shift)``: their cotangents in the source's turned frame.
 

@@ -3,13 +3,13 @@
 import numpy as np
 
 from bbr_layer.kernels.cpu_adam import advance, retreat
-from bbr_layer.kernels.cpu_compiling import exact, exact_part
+from bbr_layer.kernels.cpu_compiling import exact
 from bbr_layer.kernels.cpu_matched import slope_of
 from bbr_layer.kernels.cpu_matched_adjoint import add_adjoint, add_weights
 from bbr_layer.kernels.cpu_mutual import mutual_pairs
 
 
-@exact_part
+@exact
 def _pairs(search, pose, index, mutual, counts):  # type: ignore[no-untyped-def]
     """The pairs at a pose into ``index`` and ``mutual``, in the rows of the clouds; ``counts (2, 3)`` grow.
 

@@ -8,7 +8,7 @@ nearer, the reach of the list proves the champion to be the nearest, or the whol
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import exact, exact_part
+from bbr_layer.kernels.cpu_compiling import exact
 from bbr_layer.kernels.cpu_walk import UNKNOWN, look_up, placed, refresh_all, remember, squared_distance
 from bbr_layer.trees import ROUNDING
 
@@ -29,7 +29,7 @@ def champions(index, distance, count):  # type: ignore[no-untyped-def]
     return champion, nearest
 
 
-@exact_part
+@exact
 def _denied(lists, rival, place, squared):  # type: ignore[no-untyped-def]
     """A listed point that is nearer than the rival, or -1 and the least squared distance of the others."""
     x, y, z = place
@@ -45,7 +45,7 @@ def _denied(lists, rival, place, squared):  # type: ignore[no-untyped-def]
     return -1, second
 
 
-@exact_part
+@exact
 def contest(lists, moving, pose, held, memory):  # type: ignore[no-untyped-def]
     """Bring the memory of chosen points up to date: the champion where it is the nearest, else any nearer one.
 
@@ -98,7 +98,7 @@ def agreeing(index, back):  # type: ignore[no-untyped-def]
     return mutual
 
 
-@exact_part
+@exact
 def _reversed(pose):  # type: ignore[no-untyped-def]
     rotation, translation = pose
     turned, shift = np.empty((3, 3)), np.empty(3)

@@ -6,18 +6,18 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from bbr_layer.kernels.cpu_compiling import compiled_part
+from bbr_layer.kernels.cpu_compiling import compiled
 from bbr_layer.kernels.cpu_limits import clipped, if_free
 from bbr_layer.kernels.cpu_math import ONE, TWO, ZERO, exp_negative, share_of
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def three(array, channel, first, last):  # type: ignore[no-untyped-def]
     """Columns ``first`` to ``last`` of three channels, as plain slices."""
     return array[channel, first:last], array[channel + 1, first:last], array[channel + 2, first:last]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def add_three(array, channel, i, vector):  # type: ignore[no-untyped-def]
     """Add a vector to three channels of row ``i``."""
     array[channel, i] += vector[0]
@@ -25,7 +25,7 @@ def add_three(array, channel, i, vector):  # type: ignore[no-untyped-def]
     array[channel + 2, i] += vector[2]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def add_at(slices, j, vector):  # type: ignore[no-untyped-def]
     """Add a vector to entry ``j`` of three slices."""
     slices[0][j] += vector[0]
@@ -33,7 +33,7 @@ def add_at(slices, j, vector):  # type: ignore[no-untyped-def]
     slices[2][j] += vector[2]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def add_up(total, part):  # type: ignore[no-untyped-def]
     """Add ``part`` to the first channels of ``total``, which may be more precise."""
     for k in range(part.shape[0]):
@@ -56,38 +56,38 @@ def _kept_row(kept, i, first, last):  # type: ignore[no-untyped-def]
     return lambda kept, i, first, last: (kept[0][i, first:last], kept[1][i, first:last], kept[2][i, first:last])
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def dot(a, b):  # type: ignore[no-untyped-def]
     """Inner product of two vectors of space."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def scaled(vector, factor):  # type: ignore[no-untyped-def]
     """A vector of space times a number."""
     return vector[0] * factor, vector[1] * factor, vector[2] * factor
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def plus(a, b):  # type: ignore[no-untyped-def]
     """The sum of two vectors of space."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def inverse_of(root):  # type: ignore[no-untyped-def]
     """One over a length; 0 at 0."""
     return ONE / root if root > ZERO else ZERO
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def length(squared, smooth):  # type: ignore[no-untyped-def]
     """Root of a square, rounded off, and its inverse; 0 and 0 at 0."""
     root = np.sqrt(squared + smooth)
     return root, inverse_of(root)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def measured(seen, j, squared, scales):  # type: ignore[no-untyped-def]
     """exp(-D / alpha), the distance and its inverse: of ``squared``, or as ``seen`` has them for column ``j``.
 
@@ -99,7 +99,7 @@ def measured(seen, j, squared, scales):  # type: ignore[no-untyped-def]
     return seen[0][j], seen[1][j], inverse_of(seen[1][j])
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def measured_rate(seen, j, squared, half_rate, scales):  # type: ignore[no-untyped-def]
     """The same, and the distance's rate; ``half_rate`` is half the rate of ``squared``."""
     if seen is None:
@@ -108,7 +108,7 @@ def measured_rate(seen, j, squared, half_rate, scales):  # type: ignore[no-untyp
     return seen[0][j], seen[1][j], inverse_of(seen[1][j]), seen[2][j]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def plane(offset, row_normal, column_normal, align):  # type: ignore[no-untyped-def]
     """Sign of the row's normal, the sum of the two normals (Eq. 7), and the residual along it."""
     sign = -ONE if align * dot(row_normal, column_normal) < ZERO else ONE
@@ -120,20 +120,20 @@ def plane(offset, row_normal, column_normal, align):  # type: ignore[no-untyped-
     return sign, total, dot(offset, total)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def point_of(rows, i):  # type: ignore[no-untyped-def]
     """The first three channels of row ``i``."""
     return rows[0, i], rows[1, i], rows[2, i]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def plane_square(offset, normals, align, limit):  # type: ignore[no-untyped-def]
     """The square of Eq. 7's distance; ``normals`` are (row's, column's)."""
     _, _, residual = plane(offset, normals[0], normals[1], align)
     return clipped(residual * residual, limit)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def plane_square_rate(motion, normals, align, limit):  # type: ignore[no-untyped-def]
     """The same and half its rate; ``motion`` is (offset, velocity), ``normals`` (row's, column's, its velocity)."""
     _, total, residual = plane(motion[0], normals[0], normals[1], align)
@@ -141,7 +141,7 @@ def plane_square_rate(motion, normals, align, limit):  # type: ignore[no-untyped
     return clipped(squared, limit), if_free(half_rate, squared, limit)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def slope(e, distance, row, column, loss):  # type: ignore[no-untyped-def]
     """Derivatives of the loss by u = -D / alpha of this pair, and by its distance.
 
@@ -153,13 +153,13 @@ def slope(e, distance, row, column, loss):  # type: ignore[no-untyped-def]
     return by_logit, loss[2] * buddies - by_logit * loss[0]
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def logit_rate(distance, distance_rate, cool, cool_rate):  # type: ignore[no-untyped-def]
     """Rate of change of -D / alpha; ``cool_rate`` is that of alpha over alpha."""
     return cool * (distance * cool_rate - distance_rate)
 
 
-@compiled_part(forceinline=True)
+@compiled(forceinline=True)
 def slope_rate(at, rates, row, column, loss):  # type: ignore[no-untyped-def]
     """Rates of change of what ``slope`` answers, after the two themselves.
 

@@ -4,20 +4,20 @@ import math
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import exact, exact_part
+from bbr_layer.kernels.cpu_compiling import exact
 
 # Below this angle (rad) the factors of the exponential's derivative are taken from their series, cut after the third
 # term: its error there is below 1e-16.
 SMALL_ANGLE = 1e-2
 
 
-@exact_part
+@exact
 def cross(a, b):  # type: ignore[no-untyped-def]
     """The cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@exact_part
+@exact
 def apply(matrix, vector):  # type: ignore[no-untyped-def]
     """A matrix ``(3, 3)`` times a vector."""
     x, y, z = vector
@@ -28,7 +28,7 @@ def apply(matrix, vector):  # type: ignore[no-untyped-def]
     )
 
 
-@exact_part
+@exact
 def apply_transposed(matrix, vector):  # type: ignore[no-untyped-def]
     """The transpose of a matrix ``(3, 3)`` times a vector."""
     x, y, z = vector
@@ -39,7 +39,7 @@ def apply_transposed(matrix, vector):  # type: ignore[no-untyped-def]
     )
 
 
-@exact_part
+@exact
 def product(a, b):  # type: ignore[no-untyped-def]
     """The product of two matrices ``(3, 3)``."""
     out = np.zeros((3, 3))
@@ -49,7 +49,7 @@ def product(a, b):  # type: ignore[no-untyped-def]
     return out
 
 
-@exact_part
+@exact
 def _factors(angle):  # type: ignore[no-untyped-def]
     """``sin(a) / a``, ``(1 - cos a) / a^2`` and ``(a - sin a) / a^3``."""
     square = angle * angle
@@ -87,7 +87,7 @@ def exponential(vector):  # type: ignore[no-untyped-def]
     return out
 
 
-@exact_part
+@exact
 def through_exponential(vector, torque):  # type: ignore[no-untyped-def]
     """Pull a torque on ``exp(w)`` back to w: ``J^T torque``, where ``d exp(w) = hat(J dw) exp(w)``.
 
@@ -104,7 +104,7 @@ def through_exponential(vector, torque):  # type: ignore[no-untyped-def]
     )
 
 
-@exact_part
+@exact
 def axial(matrix):  # type: ignore[no-untyped-def]
     """``<M, hat(e_k)>`` for each axis k: the torque of a force M on a matrix that turns."""
     return matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bbr_layer.kernels.cpu_compiling import exact, exact_part
+from bbr_layer.kernels.cpu_compiling import exact
 from bbr_layer.trees import ROUNDING
 
 UNKNOWN = -1.0  # reach of a neighbour that nothing is known of
@@ -48,7 +48,7 @@ class Memory(NamedTuple):
     distance: np.ndarray
 
 
-@exact_part
+@exact
 def placed(rotation, translation, points, row):  # type: ignore[no-untyped-def]
     x, y, z = points[row, 0], points[row, 1], points[row, 2]
     return (
@@ -58,13 +58,13 @@ def placed(rotation, translation, points, row):  # type: ignore[no-untyped-def]
     )
 
 
-@exact_part
+@exact
 def squared_distance(points, row, x, y, z):  # type: ignore[no-untyped-def]
     dx, dy, dz = x - points[row, 0], y - points[row, 1], z - points[row, 2]
     return dx * dx + dy * dy + dz * dz
 
 
-@exact_part
+@exact
 def remember(memory, row, at, reach, place):  # type: ignore[no-untyped-def]
     """That of a moved point at this place the nearest is ``at``, and no other one nearer than ``reach``."""
     memory.found[row], memory.reach[row] = at, reach
@@ -72,7 +72,7 @@ def remember(memory, row, at, reach, place):  # type: ignore[no-untyped-def]
         memory.places[row, axis] = place[axis]
 
 
-@exact_part
+@exact
 def _walk(points, nearest, start, place):  # type: ignore[no-untyped-def]
     """Where the walk from ``start`` ends, its squared distance, and that of the next one in the last list."""
     x, y, z = place
@@ -133,7 +133,7 @@ def refresh(lists, moving, pose, wanted, memory):  # type: ignore[no-untyped-def
     return searched, undecided[:open_rows]
 
 
-@exact_part
+@exact
 def look_up(points, row, memory):  # type: ignore[no-untyped-def]
     """Compare a moved point, at its place, with every one: the first of the nearest, and the reach beyond it."""
     x, y, z = memory.places[row]
