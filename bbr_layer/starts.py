@@ -10,16 +10,15 @@ from torch import Tensor
 from bbr_layer.alike import leaders, moved_little
 from bbr_layer.backward import Detached
 from bbr_layer.descent import descended
+from bbr_layer.fit_score import score
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.gauss_newton import GaussNewton
-from bbr_layer.inner.pose_gradient import PairKernel
-from bbr_layer.losses import BuddyFilter, SoftBBS
-from bbr_layer.matches import matched
+from bbr_layer.losses import BuddyFilter
 from bbr_layer.named_stages import FINE_POINTS
 from bbr_layer.pair import CloudPair, Frame
 from bbr_layer.registration import StageResult
 from bbr_layer.rotations import rotation_dimensions
-from bbr_layer.stage import SOFT_SMOOTHING, Stage
+from bbr_layer.stage import Stage
 from bbr_layer.temperature import Annealed
 from bbr_layer.thinning import thinned_pair
 
@@ -29,9 +28,6 @@ TURN = math.radians(40)
 # Point spacings that the soft buddies of every start but the first begin at: a start that is only near needs to see
 # farther. Chosen; no benchmark compares it with others.
 HOT = 8.0
-# A buddy is near within so many point spacings, and lies on its plane within about so many: F begins that rounded. Both
-# chosen; what they do is seen in benchmarks/starts.md.
-NEAR, ON_PLANE = 2.0, 0.3
 # Another start replaces the first where its score is higher by this share, so that rounding does not choose between
 # starts that end alike. Chosen.
 RELUCTANCE = 0.05
@@ -83,7 +79,8 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
 
     Where the stages end, in space, with an F of finite reach, its iterations are then begun from rotations about the
     best answer in the same way: F from afar has pulled some of them past the right one. Not with features, whose
-    gradient soft buddies alone have. On more points than were tried they go on from where they ended on those.
+    gradient soft buddies alone have. Of more points than were tried the stages that see more go on from where it
+    ended.
 
     The stages are to be run again from the chosen start, which gives the gradient of that run: to go on with steps of
     Adam from where it ended instead would make the first ones, as long as ever, answer to a gradient of nearly 0.
@@ -101,7 +98,8 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
     d = clouds[0].P.shape[-1]
     if count > most_starts(d):
         raise ValueError(f"starts is {count}; in {d}D there are {most_starts(d)} of them at most: try 7")
-    tried = thinned_pair(clouds[0], _tried_points(stages))
+    few = _tried_points(stages)
+    tried = thinned_pair(clouds[0], few)
     whole = tried.P.shape == clouds[0].P.shape and tried.Q.shape == clouds[0].Q.shape
     found = _best_turn(stages, (tried, clouds[1]), begun, turns(count, d))
     loss = stages[-1].loss
@@ -110,7 +108,9 @@ def best_start(count: int, stages: list[Stage], clouds: tuple[CloudPair, Frame],
         around = Stage(BuddyFilter(reach=loss.reach), inner, rounding, points=AROUND_POINTS)
         near = turns(1 + 2 * rotation_dimensions(d), d, AROUND)
         found = _best_turn([around, stages[-1]], (tried, clouds[1]), found.ended.motion, near)
-        found = found if whole else found._replace(motion=found.ended.motion)
+        if few and not whole:
+            later = [stage for stage in stages if stage.points is None or stage.points > few]
+            found = found._replace(motion=found.ended.motion, stages=later or stages[-1:])
     return found._replace(whole=whole)
 
 
@@ -183,16 +183,3 @@ def _heated(stage: Stage, hot: Tensor) -> Stage:
     heats = torch.where(hot, own.clamp(min=HOT), own)
     cooling = Annealed(heats, stage.temperature.end)
     return Stage(stage.loss, stage.inner, cooling, stage.chart, points=stage.points, dimension=stage.dimension)
-
-
-def score(pair: CloudPair, motion: RigidMotion) -> Tensor:
-    """How well the centred clouds fit, the more the better, ``(batch,)`` float64; comparable between motions."""
-    if pair.P_normals is None or pair.Q_normals is None:
-        loss = SoftBBS(smoothing=SOFT_SMOOTHING)
-        kernel = PairKernel(loss.kernel(pair), pair, loss.smoothing * pair.known_spacing().double())
-        return -kernel.slope(motion, loss.temperature_unit(pair).double()).loss
-    found, spacing = matched(pair, motion), pair.known_spacing().double()[:, None]
-    planes, _ = found.normal_parts()
-    near = found.mutual & (torch.linalg.vector_norm(found.offsets, dim=-1) < NEAR * spacing)
-    off_plane = (found.offsets * planes).sum(-1) / (ON_PLANE * spacing)
-    return torch.where(near, torch.exp(-off_plane.square()), 0.0).sum(-1)

@@ -55,7 +55,7 @@ ORDER = {
         backward transforms preparation
         stage
         named_stages descent
-        buddies_loss
+        buddies_loss fit_score
         starts
         layer
         atomic cloud_columns
