@@ -6,18 +6,20 @@ from problems import noisy_pair
 
 from bbr_layer import (
     Adam,
+    Autograd,
     BBRLayer,
     CloudPair,
     Constant,
     Cosine,
     EulerAngles,
     Learned,
+    Replay,
     SoftBBS,
     SoftBD,
     Stage,
     StepDown,
 )
-from bbr_layer.inner.adam import Moments, adam_direction
+from bbr_layer.inner.adam import Moments, adam_direction, without_rounding
 from bbr_layer.rotations import rotation_from_euler
 
 STEPS = 100
@@ -84,3 +86,22 @@ def test_shared_moments_have_no_special_axis():
 def test_wrong_settings_are_refused(settings, sentence, as_a_user):
     with pytest.raises(ValueError, match=sentence):
         Adam(**settings)
+
+
+def test_a_gradient_that_is_rounding_is_none_with_its_derivative():
+    gradient = torch.tensor([[3e-13, 4e-13, 7.0], [3e-12, 4e-12, 7.0]], requires_grad=True)
+    kept = without_rounding(gradient, 1e-12, 2)
+    torch.testing.assert_close(kept, torch.tensor([[0.0, 0.0, 7.0], [3e-12, 4e-12, 7.0]]), rtol=0, atol=0)
+    (derivative,) = torch.autograd.grad(kept.sum(), gradient)
+    assert derivative.tolist() == [[0.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
+
+
+@pytest.mark.parametrize("backward", [Replay(), Autograd()], ids=["replay", "autograd"])
+def test_a_pair_at_its_optimum_stays_there(backward):
+    P = torch.randn(30, 3, dtype=torch.float64)
+    Q = P.clone().requires_grad_()
+    for name in ("softBBS", "F"):
+        result = BBRLayer(name, inner=Adam(5), backward=backward)(P, Q)
+        assert torch.equal(result.target_from_source.matrix, torch.eye(4, dtype=torch.float64))
+        found = torch.autograd.grad(result.target_from_source.rotation.sum(), Q)[0]
+        assert found.abs().max() < 1e-9, "Adam heard the rounding"

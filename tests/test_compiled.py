@@ -9,7 +9,7 @@ from problems import noisy_pair
 from scipy.spatial.transform import Rotation
 
 from bbr_layer import Adam, Annealed, BBRLayer, CloudPair, Replay, RigidMotion, backend
-from bbr_layer.inner.adam import Moments, adam_direction
+from bbr_layer.inner.adam import Moments, adam_direction, without_rounding
 from bbr_layer.kernels.reference import soft_directional, soft_gradient
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 
@@ -127,14 +127,15 @@ def test_the_backend_says_what_it_is_and_may_be_named(monkeypatch):
         backend()
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("d", [2, 3])
-def test_compiled_adam_is_adam(d, shared, rng):
+def test_compiled_adam_is_adam(d, shared, noise, rng):
     steps, axes = 4, AXES[d]
     k, free = len(axes), np.isin(np.arange(6), axes).astype(float)
     rates = np.zeros((steps, 6))
     rates[:, axes] = rng.uniform(0.01, 0.1, size=(steps, k))
-    course = cpu_adam.Course(np.ones(steps), rates, free, (0.9, 0.999, 1e-8), shared, 0)
+    course = cpu_adam.Course(np.ones(steps), rates, free, (0.9, 0.999, 1e-8), shared, 0, noise)
     shapes = (steps + 1, 3, 3), (steps + 1, 3), (steps + 1, 6), (steps + 1, 6), (steps, 6)
     trace = cpu_adam.Trace(*map(np.zeros, shapes))
     trace.rotations[0] = np.eye(3)
@@ -142,8 +143,10 @@ def test_compiled_adam_is_adam(d, shared, rng):
     for step in range(steps):
         trace.gradients[step] = rng.normal(size=6)
         trace.gradients[step, 2] = 0.0  # a component that has never moved
+        trace.gradients[step] *= 1e-3 if step == 2 else 1.0
+        gradient = torch.from_numpy(trace.gradients[step : step + 1, axes].copy())
         direction, moments = adam_direction(
-            torch.from_numpy(trace.gradients[step : step + 1, axes].copy()),
+            without_rounding(gradient, noise, k),
             moments,
             betas=(0.9, 0.999),
             eps=1e-8,

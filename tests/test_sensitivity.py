@@ -27,9 +27,9 @@ def exact_copy(P: Tensor) -> Tensor:
     return RigidMotion.from_rotvec(math.radians(20) * axis, shift).inverse()(P)
 
 
-def shares_of_sensitivity(layer: BBRLayer, P: Tensor) -> Tensor:
-    """For each component of the pose the norm of its gradient over the analytic one."""
-    Q = exact_copy(P).requires_grad_()
+def shares_of_sensitivity(layer: BBRLayer, P: Tensor, Q: Tensor | None = None) -> Tensor:
+    """For each component of the pose the norm of its gradient over the analytic one; ``Q`` is an exact copy."""
+    Q = (exact_copy(P) if Q is None else Q.clone()).requires_grad_()
     result = layer(P, Q)
     wanted = torch.linalg.inv(result.information).diagonal().sqrt()
     found = [torch.autograd.grad(x, Q, retain_graph=True)[0].norm() for x in tangent(result, Q)]
@@ -43,6 +43,15 @@ def assert_honest(shares: Tensor) -> None:
 @pytest.mark.parametrize("n", [100, 500])
 def test_an_exact_copy_of_a_surface(n):
     assert_honest(shares_of_sensitivity(BBRLayer(), bumpy(n, 3)))
+
+
+@pytest.mark.parametrize("layer", [BBRLayer(), BBRLayer.fast(), BBRLayer.robust()], ids=["default", "fast", "robust"])
+@pytest.mark.parametrize("shift", [0.0, 0.01], ids=["itself", "moved"])
+def test_an_exact_copy_begun_where_it_ends(shift, layer):
+    # Centroid on centroid is the answer here: nothing is left of the gradient but its rounding. Every fourth point lies
+    # anywhere, with a normal of its own.
+    P = torch.cat((bumpy(300, 3), 2 * torch.rand(100, 3, dtype=torch.float64) - 1))
+    assert_honest(shares_of_sensitivity(layer, P, P - shift))
 
 
 @pytest.mark.parametrize("layer", [BBRLayer(), BBRLayer.fast()], ids=["default", "fast"])

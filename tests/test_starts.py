@@ -241,6 +241,18 @@ def test_the_gradient_is_that_of_the_run_from_the_chosen_start():
     torch.testing.assert_close((found * direction).sum(), (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-6)
 
 
+def test_on_more_points_than_are_tried_the_gradient_is_that_from_one_start():
+    torch.manual_seed(1)
+    P, Q = bumpy(1200, 3), bumpy(1200, 3)
+    found = []
+    for layer in (BBRLayer(), BBRLayer.robust()):
+        source = Q.clone().requires_grad_()
+        moved = layer(P, source).target_from_source(torch.eye(3, dtype=torch.float64))
+        found.append(torch.autograd.grad(moved.sum(), source)[0].flatten())
+    assert torch.nn.functional.cosine_similarity(*found, dim=0) > 0.99
+    assert abs(found[1].norm() / found[0].norm() - 1) < 0.1
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_turns_are_all_different_and_no_longer_than_half_a_turn(d):
     count = most_starts(d)

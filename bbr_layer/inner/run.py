@@ -105,7 +105,7 @@ def _walked(
     temperatures = _temperatures(problem, range(done, last))
     rates = inner.rates((rotation_dimensions(d), d), at.moments.first, range(done, last))
     begun = (*at.state, at.moments.first, at.moments.second)
-    end = walk(Steps(look, inner, done, seen), (loss.pair, loss.rounding), begun, temperatures, rates)
+    end = walk(Steps(look, inner, done, seen, problem.noise), (loss.pair, loss.rounding), begun, temperatures, rates)
     moments = Moments(end.first, end.second, last)
     state = State(end.rotation, end.translation)
     at = at._replace(state=state, temperature=temperatures[-1], moments=moments, gradient_norm=end.gradient_norm)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.inner.adam import Adam, Moments, adam_direction
+from bbr_layer.inner.adam import Adam, Moments, adam_direction, without_rounding
 from bbr_layer.inner.charts import Chart, State, tangent_zero
 from bbr_layer.inner.gauss_newton import GaussNewton, shortened
 from bbr_layer.inner.pose_gradient import PairKernel
@@ -28,6 +28,7 @@ class Problem(NamedTuple):
     unit: Tensor  # (batch,) float64, the spacing that temperatures are multiples of
     inner: Adam | GaussNewton
     squares: BoundSquares | None = None  # the loss as GaussNewton sees it
+    noise: float = 0.0  # a gradient by the pose that is no longer than this is rounding
 
 
 class Progress(NamedTuple):
@@ -77,11 +78,12 @@ def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
     loss, gradient = loss_gradient(problem, at.state, temperature, differentiable)
     d = problem.frame.target_centre.shape[-1]
     blocks = (rotation_dimensions(d), d) + ((1,) if learned else ())
+    pose_size = blocks[0] + blocks[1]
+    gradient = without_rounding(gradient, problem.noise, pose_size)
     direction, moments = adam_direction(
         gradient, at.moments, betas=inner.betas, eps=inner.eps, blocks=blocks if inner.shared else None
     )
     move = -inner.rates(blocks, direction, [at.moments.step]) * direction
-    pose_size = blocks[0] + blocks[1]
     state = problem.chart.moved(at.state, move[:, :pose_size])
     later = torch.maximum(temperature + move[:, -1], floor(problem)) if learned else temperature
     better = (loss < at.best_loss).detach()

@@ -47,12 +47,14 @@ class Steps(NamedTuple):
     inner: the optimiser.
     done: steps of this stage taken before.
     seen: the step of this stage before which the pose is also told.
+    noise: as ``Course`` has it.
     """
 
     look: Callable[[CloudPair, Tensor], Scene]
     inner: Adam
     done: int
     seen: int
+    noise: float
 
     def course(self, temperatures: Tensor, rates: Tensor, dimension: int) -> Callable[[int], Course]:
         """How each item goes, from ``(steps, batch)`` and ``(steps, k)``."""
@@ -60,7 +62,7 @@ class Steps(NamedTuple):
         free[axes] = 1
         heats, constants = np.ascontiguousarray(temperatures.numpy().T), (*self.inner.betas, self.inner.eps)
         speeds = _spread(rates, axes)
-        return lambda b: Course(heats[b], speeds, free, constants, self.inner.shared, self.done)
+        return lambda b: Course(heats[b], speeds, free, constants, self.inner.shared, self.done, self.noise)
 
 
 class Walked(NamedTuple):

@@ -24,6 +24,7 @@ class Course(NamedTuple):
     constants: the two betas, epsilon.
     shared: whether rotation and translation each share one second moment.
     done: steps taken before.
+    noise: a gradient no longer than this is rounding, and counts as 0.
     """
 
     temperatures: np.ndarray
@@ -32,6 +33,7 @@ class Course(NamedTuple):
     constants: tuple[float, float, float]
     shared: bool
     done: int
+    noise: float
 
 
 class Trace(NamedTuple):
@@ -87,15 +89,17 @@ def _turn(rates, direction):  # type: ignore[no-untyped-def]
 # Loops instead of expressions of arrays: compiling those takes seconds more, most of them for the words of errors.
 @exact
 def advance(course, trace, step):  # type: ignore[no-untyped-def]
-    """From point ``step`` of the trace, along the gradient there, to the next point."""
+    """From point ``step`` of the trace, along the gradient there, to the next point; rounding is taken off it."""
     fast, slow, _ = course.constants
     gradient, first, second = trace.gradients[step], trace.firsts[step + 1], trace.seconds[step + 1]
     squares = np.empty(6)
     for k in range(6):
+        gradient[k] *= course.free[k]
         squares[k] = gradient[k] * gradient[k]
+    if squares.sum() <= course.noise * course.noise:
+        gradient[:], squares[:] = 0.0, 0.0
     _mean_in_blocks(squares, course.free, course.shared)
     for k in range(6):
-        gradient[k] *= course.free[k]
         first[k] = fast * trace.firsts[step, k] + (1 - fast) * gradient[k]
         second[k] = slow * trace.seconds[step, k] + (1 - slow) * squares[k]
     direction, _ = _direction(first, second, course.constants, course.done + step + 1)
@@ -116,7 +120,7 @@ def retreat(course, trace, step, back, by_rates):  # type: ignore[no-untyped-def
     direction, roots = _direction(trace.firsts[step + 1], second, course.constants, number)
     vector = _turn(course.rates[step], direction)
     torque = axial(product(back.rotation, trace.rotations[step + 1].T))
-    by_move, by_second, by_gradient = np.zeros(6), np.zeros(6), np.zeros(6)
+    by_move, by_second, by_gradient, heard = np.zeros(6), np.zeros(6), np.zeros(6), np.any(gradient != 0)
     by_move[0], by_move[1], by_move[2] = through_exponential(vector, torque)
     for k in range(3):
         by_move[3 + k] = back.translation[k]
@@ -133,7 +137,8 @@ def retreat(course, trace, step, back, by_rates):  # type: ignore[no-untyped-def
         back.first[k], back.second[k] = fast * by_first, slow * by_second[k]
     _mean_in_blocks(by_second, course.free, course.shared)
     for k in range(6):
-        by_gradient[k] = course.free[k] * (by_gradient[k] + 2 * (1 - slow) * gradient[k] * by_second[k])
+        whole = course.free[k] * (by_gradient[k] + 2 * (1 - slow) * gradient[k] * by_second[k])
+        by_gradient[k] = whole if heard else 0.0
     turn = exponential(vector)
     for column in range(3):
         rotation = back.rotation[:, column]
