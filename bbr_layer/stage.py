@@ -26,8 +26,9 @@ from bbr_layer.thinning import thinned_pair
 # Rounding of soft distances at zero, in point spacings: the measured value at which the unrolled gradient of an exact
 # copy equals finite differences; 0.001 leaves it at 1e2 to 1e5.
 SOFT_SMOOTHING = 0.2
-# Rounding errors of the clouds' type that a gradient by the pose must exceed, per point where the loss is a sum. Chosen: a
-# pose with such a gradient is off by far less than a spacing, and a quarter is too little for some exact copies.
+# Rounding errors of the clouds' type that a gradient by the pose must exceed, per point where the loss is a sum.
+# Chosen: a pose with such a gradient is off by far less than a spacing, and a quarter is too little for some exact
+# copies.
 ROUNDING = 4000
 # What a stage must see at least: a plane has three, and one more shows its other side.
 FEWEST_POINTS = 4
