@@ -103,6 +103,7 @@ ORDER = {
         alignment mapping_module
         surface_map
         keep_best
+        settling
         training
         mapping
         console

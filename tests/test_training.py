@@ -7,10 +7,12 @@ import pytest
 import torch
 from small_worlds import displaced, small_config, small_world, true_edges, true_poses
 
+from bbr_layer import RigidMotion
 from train.alignment import Alignment
 from train.data_module import prepare_scan
 from train.keep_best import SCORE
 from train.run_folder import open_run
+from train.settling import MOVED, trajectory_change
 from train.surface_map import MapScore, SurfaceMap
 from train.training import LAST, train_map
 
@@ -49,7 +51,7 @@ def test_a_killed_training_goes_on_to_the_same_bits(tmp_path, epoch, adjust):
     assert resumed.curves == whole.curves
     assert resumed.kept_epoch == whole.kept_epoch
     assert (whole.kept_epoch > 0) == (not adjust), "after the adjustment no epoch is better here"
-    assert [len(curve) for curve in whole.curves.values()] == [6, 5, 5, 5]
+    assert [len(curve) for curve in whole.curves.values()] == [6, 5, 5, 5, 5]
 
 
 def test_a_finished_training_is_not_done_again(tmp_path):
@@ -61,6 +63,30 @@ def test_a_finished_training_is_not_done_again(tmp_path):
     assert {stage for stage, *_ in told} == {"adjustment"}
     assert torch.equal(again.world_from_scan.matrix, first.world_from_scan.matrix)
     assert again.curves == first.curves
+
+
+@pytest.mark.parametrize("epoch", [4, 5, 7])
+def test_poses_that_no_longer_move_settle_early_however_often_it_was_broken_off(tmp_path, epoch):
+    scans = small_world()
+    config = small_config(epochs=20, points=20, warm_up=0.1, settle=0.2, localisation_rate=1e-6, adjust=False)
+    problem = scans, true_edges(scans), displaced(true_poses(scans), 0.1), config
+    whole = train_map(*problem)
+    # Two epochs to warm up, three of rest, one whose rate is set by then, four to settle.
+    assert len(whole.curves["total"]) == len(whole.curves[MOVED]) == 10
+    with pytest.raises(Killed):
+        train_map(*problem, folder=tmp_path, progress=killed_after(epoch))
+    resumed = train_map(*problem, folder=tmp_path)
+    assert torch.equal(weights(resumed), weights(whole))
+    assert resumed.curves == whole.curves
+
+
+def test_the_change_of_a_trajectory_counts_turns_at_the_points():
+    still = RigidMotion.identity(2, (2,))
+    moved = RigidMotion.from_rotvec(
+        torch.tensor([[0.0], [0.1]]).double(), torch.tensor([[3.0, 4.0], [0.0, 0.0]]).double()
+    )
+    assert trajectory_change(still, moved, torch.tensor([1.0, 20.0]).double()) == pytest.approx(((25 + 4) / 2) ** 0.5)
+    assert trajectory_change(moved, moved, torch.ones(2).double()) < 1e-12
 
 
 def test_without_a_folder_nothing_is_written_and_the_answer_is_the_same(tmp_path, monkeypatch):
@@ -137,7 +163,7 @@ def test_logs_for_people_and_programs(tmp_path):
     scans = small_world()
     train_map(scans, true_edges(scans), true_poses(scans), small_config(), folder=tmp_path)
     lines = (tmp_path / "logs" / "csv" / "version_0" / "metrics.csv").read_text().splitlines()
-    assert {"epoch", SCORE, "loss/total", "loss/occupancy", "loss/registration"} <= set(lines[0].split(","))
+    assert {"epoch", SCORE, MOVED, "loss/total", "loss/occupancy", "loss/registration"} <= set(lines[0].split(","))
     assert len(lines) == 3
     assert list((tmp_path / "logs" / "tensorboard" / "version_0").glob("events*"))
 

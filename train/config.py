@@ -60,7 +60,8 @@ class TrainingConfig(Settings):
     keep: "best", the poses that align held-out points best, the starting ones included; "last", where the training
         ends, better or not: to compare registration terms.
     warm_up, settle: shares of the epochs, at the beginning and at the end, in which only the occupancy network
-        learns: first the starting map, before it may move a pose; at last the map of the poses that were kept.
+        learns: first the starting map, before it may move a pose; at last, earlier where poses no longer move, the map
+        of the poses that were kept.
     group: consecutive scans in one step; the partners of their loop edges come on top.
     points: most points of a scan in one step, drawn anew in every epoch.
     free_samples: points of free space per ray.

@@ -39,16 +39,16 @@ class KeepBest(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if self.kept is None:
-            module = _mapping(pl_module)
+            module = mapping_of(pl_module)
             self.curves = {SCORE: [self.alignment(module.poses(self.data.every_scan()))]}
             self.kept = copy.deepcopy(module.model.localisation.state_dict())
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if trainer.current_epoch == _mapping(pl_module).schedule.settles_at:
-            self.restore(_mapping(pl_module))
+        if trainer.current_epoch == mapping_of(pl_module).schedule.settles_at:
+            self.restore(mapping_of(pl_module))
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        module, epoch = _mapping(pl_module), trainer.current_epoch
+        module, epoch = mapping_of(pl_module), trainer.current_epoch
         score = self.alignment(module.poses(self.data.every_scan()))
         if score < self.curves[SCORE][self.kept_epoch] - self.margin:
             self.kept_epoch = epoch + 1
@@ -78,10 +78,16 @@ class ReportProgress(L.Callback):
         self.progress = progress
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self.progress("training", trainer.current_epoch + 1, _mapping(pl_module).schedule.epochs)
+        self.progress("training", trainer.current_epoch + 1, mapping_of(pl_module).schedule.epochs)
 
 
-def _mapping(module: L.LightningModule) -> MappingModule:
+def mapping_of(module: L.LightningModule) -> MappingModule:
+    """The module, which must be the mapper.
+
+    Raises
+    ------
+    TypeError: it is another.
+    """
     if not isinstance(module, MappingModule):
         raise TypeError(f"the trained module is a {type(module).__name__}; these callbacks need a MappingModule")
     return module

@@ -29,13 +29,21 @@ class Schedule(NamedTuple):
         """The first epoch after the poses have stopped moving."""
         return self.warm_up + self.joint
 
+    def moves(self, epoch: int) -> bool:
+        """Whether poses may move in that epoch."""
+        return self.warm_up <= epoch < self.settles_at
+
+    def settling_at(self, epoch: int) -> "Schedule":
+        """The same, but that poses stop moving before ``epoch``."""
+        return self._replace(joint=epoch - self.warm_up)
+
     def progress(self, epoch: int) -> float:
         """Share in [0, 1] of the joint phase that is done when ``epoch`` begins; what terms anneal by."""
         return min(max((epoch - self.warm_up) / max(self.joint - 1, 1), 0.0), 1.0)
 
     def localisation_rate(self, epoch: int) -> float:
         """Factor of L-Net's learning rate: a half cosine over the joint phase, 0 outside."""
-        if not self.warm_up <= epoch < self.settles_at:
+        if not self.moves(epoch):
             return 0.0
         return _cosine((epoch - self.warm_up) / self.joint)
 

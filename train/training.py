@@ -17,6 +17,7 @@ from train.keep_best import MARGIN, KeepBest, ReportProgress
 from train.mapping_module import MappingModule, build_module
 from train.pose_graph import Edges
 from train.scans import Progress, ScanSet, silent
+from train.settling import MOVED, SettleWhenStill
 from train.surface_map import MapScore, SurfaceMap
 
 # The file in the folder of checkpoints that a killed run goes on from.
@@ -32,7 +33,8 @@ class Trained:
     ----------
     world_from_scan: ``(k, ...)`` of the epoch that was kept.
     module: its M-Net knows the map of these poses.
-    curves: per epoch: "total", "occupancy", "registration"; and "alignment", which begins with the starting map.
+    curves: per epoch: "total", "occupancy", "registration", "trajectory change"; and "alignment", which begins with the
+        starting map.
     kept_epoch: 0 is the starting map, adjusted or not.
     """
 
@@ -70,12 +72,13 @@ def train_map(
     score = MapScore(Alignment(data.prepared, edges), SurfaceMap(scans, data.prepared, start.matrix.double().numpy()))
     if config.training.adjust:
         data.start = score.adjusted(data.start, progress)
-    best = KeepBest(score, data, MARGIN if config.training.keep == "best" else -math.inf)
+    margin = MARGIN if config.training.keep == "best" else -math.inf
+    best, settling = KeepBest(score, data, margin), SettleWhenStill(data)
     trainer = L.Trainer(
         accelerator=config.device,
         devices=1,
         max_epochs=config.training.epochs,
-        callbacks=_callbacks(best, folder, progress),
+        callbacks=[settling, *_callbacks(best, folder, progress)],
         logger=_loggers(folder),
         reload_dataloaders_every_n_epochs=1,
         log_every_n_steps=1,
@@ -85,14 +88,20 @@ def train_map(
         enable_progress_bar=False,
         enable_model_summary=False,
     )
-    checkpoint = folder / "checkpoints" / LAST if folder is not None else None
+    _fit(trainer, module, data, folder)
+    best.restore(module)
+    curves = best.curves | {MOVED: settling.curve}
+    return Trained(module.poses(data.every_scan()), module, curves, best.kept_epoch)
+
+
+def _fit(trainer: L.Trainer, module: MappingModule, data: MappingData, folder: Path | None) -> None:
+    """Train, from the folder's checkpoint on if there is one."""
+    checkpoint = None if folder is None else folder / "checkpoints" / LAST
     found = checkpoint is not None and checkpoint.is_file()
     with warnings.catch_warnings():
         # Lightning 2.6 walks trees by a class that torch 2.13 renames; nothing for a user to act on.
         warnings.filterwarnings("ignore", message=LEAF_SPEC, category=FutureWarning)
         trainer.fit(module, data, ckpt_path=checkpoint if found else None)
-    best.restore(module)
-    return Trained(module.poses(data.every_scan()), module, best.curves, best.kept_epoch)
 
 
 def _callbacks(best: KeepBest, folder: Path | None, progress: Progress) -> list[L.Callback]:
