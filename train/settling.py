@@ -38,6 +38,8 @@ class SettleWhenStill(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if self.schedule is not None:
             mapping_of(pl_module).schedule = self.schedule
+            # A run that had ended early is not to go on up to the epochs that were asked for.
+            trainer.should_stop = trainer.current_epoch >= self.schedule.epochs
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self.before = mapping_of(pl_module).poses(self.data.every_scan())
