@@ -128,7 +128,7 @@ class BBRLayer(nn.Module):
         ----------
         P, Q: ``(*batch, n, d)`` target and ``(*batch, m, d)`` source, d = 2 or 3, any unit.
         P_normals, Q_normals: like P and Q; estimated where a loss needs them and they are not given.
-        P_features, Q_features: ``(*batch, n, c)`` and ``(*batch, m, c)``, matched beside the coordinates.
+        P_features, Q_features: ``(*batch, n, c)`` and ``(*batch, m, c)``, matched by soft losses beside coordinates.
         P_weights, Q_weights: ``(*batch, n)`` and ``(*batch, m)``, not negative.
         P_mask, Q_mask: the same shapes, boolean, True where a point is real.
         start: where to begin. Default: the better of leaving Q in place and laying centroid on centroid.

@@ -35,7 +35,6 @@ class Loss(nn.Module, ABC):
     """
 
     needs_normals: ClassVar[bool] = False
-    matches_features: bool = False
 
     def __init__(self, smoothing: float = 0.0):
         super().__init__()
@@ -58,6 +57,10 @@ class Loss(nn.Module, ABC):
     def temperature_unit(self, pair: CloudPair) -> Tensor:
         """Spacing that temperatures are multiples of, ``(batch,)``."""
         return pair.known_spacing().to(pair.P.dtype)
+
+    def sees_features(self, pair: CloudPair) -> bool:
+        """Whether anything but coordinates, normals and weights of the pair changes the loss."""
+        return False
 
     def rounding(self, pair: CloudPair) -> Tensor | float:
         """Length below which distances are rounded off, ``(batch, 1, 1)`` or 0."""
@@ -83,7 +86,6 @@ class SoftLoss(Loss):
         if outlier < 0:
             raise ValueError(f"outlier is {outlier}; the epsilon of Eq. 4 must not be negative: try 1e-10")
         self.outlier, self.match, self.feature_weight = outlier, match, feature_weight
-        self.matches_features = match in ("features", "both")
 
     def kernel(self, pair: CloudPair) -> Kernel:
         """Sweeps over all pairs of points, by the fastest backend there is."""
@@ -118,6 +120,10 @@ class SoftLoss(Loss):
         P, Q = self._embedded(pair.P, pair.P_features, pair), self._embedded(pair.Q, pair.Q_features, pair)
         spacing = (point_spacing(P, pair.P_mask) + point_spacing(Q, pair.Q_mask)) / 2
         return torch.where(spacing > 0, spacing, 1.0)
+
+    def sees_features(self, pair: CloudPair) -> bool:
+        """Where buddies are found by them."""
+        return self._matching(pair) != "points"
 
     def _matching(self, pair: CloudPair) -> str:
         if self.match == "auto":

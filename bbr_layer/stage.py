@@ -26,9 +26,9 @@ from bbr_layer.thinning import thinned_pair
 # Rounding of soft distances at zero, in point spacings: the measured value at which the unrolled gradient of an exact
 # copy equals finite differences; 0.001 leaves it at 1e2 to 1e5.
 SOFT_SMOOTHING = 0.2
-# Rounding errors of the clouds' type that a gradient by the pose must exceed, per point where the loss is a sum.
-# Chosen: a pose with such a gradient is off by far less than a spacing, and a quarter is too little for some exact
-# copies.
+# Rounding errors of the clouds' type that a gradient by the pose must exceed, of a sum's value over its temperature
+# where the loss is a sum: those of a mean are of the size of 1. Chosen: a pose with such a gradient is off by far less
+# than a spacing, and a quarter is too little for some exact copies.
 ROUNDING = 4000
 # What a stage must see at least: a plane has three, and one more shows its other side.
 FEWEST_POINTS = 4
@@ -136,12 +136,10 @@ class Stage(nn.Module):
         squares = None
         if isinstance(self.inner, GaussNewton):
             squares = BoundSquares(self.loss.squares(pair), pair, stored=not closed_form)
-        return Problem(loss, self.chart, frame, self.temperature, unit, self.inner, squares, self._noise(pair))
-
-    def _noise(self, pair: CloudPair) -> float:
-        # softBBS is a sum over points, the others are means; the paper's chart is in data units, and left as it was.
-        points = min(pair.P.shape[1], pair.Q.shape[1]) if isinstance(self.loss, SoftBBS) else 1
-        return ROUNDING * points * torch.finfo(pair.P.dtype).eps if self.chart.scaled else 0.0
+        # The paper's chart is in data units, and left as it was.
+        noise = ROUNDING * torch.finfo(pair.P.dtype).eps if self.chart.scaled else 0.0
+        summed = isinstance(self.loss, SoftBBS)
+        return Problem(loss, self.chart, frame, self.temperature, unit, self.inner, squares, noise, summed)
 
     def __repr__(self) -> str:
         sizes = "" if self.points is None else f", points={self.points}"

@@ -24,11 +24,12 @@ from torch import Tensor
 from bbr_layer import Adam, Autograd, BBRLayer, Implicit, Replay
 from bbr_layer.kernels import cpu_batch
 from benchmarks import layer_gradients, layer_rivals, layer_sweeps, layer_threads
-from benchmarks.layer_problems import clouds
+from benchmarks.layer_problems import CHANNELS, clouds, features
 from benchmarks.memory import forget_peak, peak
 
 STEPS, RATE = 30, 0.05
-LOSSES = ("softBD", "softBBS", "N")
+BY_FEATURES = f", {CHANNELS} features"
+LOSSES = ("softBD", "softBBS", "N", f"softBD{BY_FEATURES}")
 # Points of the runs that compile, and pairs per part in them: one part and several, which are compiled apart.
 WARM_POINTS, WARM_PARTS = 50, (2500, 500)
 
@@ -42,17 +43,21 @@ class Cell(NamedTuple):
 
 
 def layer(name: str, mode: object, steps: int = STEPS) -> Callable[[Tensor, Tensor], Tensor]:
-    """The layer as a function of two clouds that answers its matrix."""
-    chosen = BBRLayer(name, inner=Adam(steps, RATE), backward=mode)
-    return lambda P, Q: chosen(P, Q).target_from_source.matrix
+    """The layer as a function of two clouds that answers its matrix; features, where named, get a gradient too."""
+    chosen = BBRLayer(name.removesuffix(BY_FEATURES), inner=Adam(steps, RATE), backward=mode)
+    beside = features if name.endswith(BY_FEATURES) else lambda n: {}
+    return lambda P, Q: chosen(P, Q, **beside(len(P))).target_from_source.matrix
 
 
 def contestants(name: str, steps: int) -> dict[str, Callable[[], Callable[[Tensor, Tensor], Tensor]]]:
     """Who is measured, by name; each is built in the process that measures it."""
-    return {
-        "plain unroll": lambda: layer(name, Autograd(), steps),
+    by_hand = {
         "checkpoint per step": lambda: layer_rivals.checkpointed(name, steps, RATE),
         "TorchOpt MetaAdam": lambda: layer_rivals.torchopt_unroll(name, steps, RATE),
+    }
+    return {
+        "plain unroll": lambda: layer(name, Autograd(), steps),
+        **({} if name.endswith(BY_FEATURES) else by_hand),
         "Replay, torch sweeps": lambda: layer(name, Replay(), steps),
         "Replay, compiled sweeps": lambda: layer(name, Replay(), steps),
         "Implicit, compiled sweeps": lambda: layer(name, Implicit(on_unconverged="warn"), steps),

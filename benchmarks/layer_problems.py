@@ -7,6 +7,8 @@ from bbr_layer import RigidMotion
 
 # Standard deviation of the noise, as a share of the sphere's radius.
 NOISE = 0.01
+# Features of a point: as many as small networks give. Their noise, where their own deviation is 1.
+CHANNELS, FEATURE_NOISE = 32, 0.1
 
 
 def clouds(n: int, batch: int = 0, shift: float = 0.0, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
@@ -17,3 +19,11 @@ def clouds(n: int, batch: int = 0, shift: float = 0.0, dtype: torch.dtype = torc
     truth = RigidMotion.from_rotvec(torch.tensor([0.1, 0.0, 0.1]).double(), torch.tensor([0.05, 0.0, 0.0]).double())
     noise = NOISE * torch.randn(shape, generator=generator, dtype=torch.float64)
     return (P + shift).to(dtype), (truth.inverse()(P + noise) + shift).to(dtype)
+
+
+def features(n: int) -> dict[str, Tensor]:
+    """Features of the points of two clouds, alike but for noise, as the layer takes them; each wants its gradient."""
+    generator = torch.Generator().manual_seed(1)
+    target, noise = torch.randn((2, n, CHANNELS), generator=generator)
+    source = target + FEATURE_NOISE * noise
+    return {"P_features": target.requires_grad_(), "Q_features": source.requires_grad_()}

@@ -14,6 +14,7 @@ from bbr_layer import (
     EulerAngles,
     Learned,
     Replay,
+    RigidMotion,
     SoftBBS,
     SoftBD,
     Stage,
@@ -90,7 +91,7 @@ def test_wrong_settings_are_refused(settings, sentence, as_a_user):
 
 def test_a_gradient_that_is_rounding_is_none_with_its_derivative():
     gradient = torch.tensor([[3e-13, 4e-13, 7.0], [3e-12, 4e-12, 7.0]], requires_grad=True)
-    kept = without_rounding(gradient, 1e-12, 2)
+    kept = without_rounding(gradient, torch.full((len(gradient),), 1e-12), 2)
     torch.testing.assert_close(kept, torch.tensor([[0.0, 0.0, 7.0], [3e-12, 4e-12, 7.0]]), rtol=0, atol=0)
     (derivative,) = torch.autograd.grad(kept.sum(), gradient)
     assert derivative.tolist() == [[0.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
@@ -105,3 +106,18 @@ def test_a_pair_at_its_optimum_stays_there(backward):
         assert torch.equal(result.target_from_source.matrix, torch.eye(4, dtype=torch.float64))
         found = torch.autograd.grad(result.target_from_source.rotation.sum(), Q)[0]
         assert found.abs().max() < 1e-9, "Adam heard the rounding"
+
+
+@pytest.mark.parametrize("backward", [Replay(), Autograd()], ids=["replay", "autograd"])
+@pytest.mark.parametrize("weights", [{"P": 1e-3}, {"P": 1 / 40, "Q": 1 / 40}], ids=["one side", "shares of one"])
+def test_small_weights_are_not_taken_for_rounding(weights, backward):
+    P = torch.randn(40, 3) * torch.tensor([1.0, 0.7, 0.5])
+    Q = P @ RigidMotion.from_rotvec(torch.tensor([0.3, 0.1, 0.0]), torch.zeros(3)).rotation.float()
+    layer, answers = BBRLayer("softBBS", inner=Adam(20, 0.05), backward=backward), []
+    for sizes in ({}, weights):
+        given = {f"{side}_weights": torch.full((40,), size, requires_grad=True) for side, size in sizes.items()}
+        source = Q.clone().requires_grad_()
+        matrix = layer(P, source, **given).target_from_source.matrix
+        answers.append((matrix.detach(), *torch.autograd.grad(matrix.square().sum(), source)))
+    assert answers[0][1].abs().max() > 1e-3
+    torch.testing.assert_close(answers[0], answers[1], rtol=1e-2, atol=1e-4)

@@ -29,12 +29,15 @@ ORDER = {
         kernels.squares
         kernels.blocks kernels.forward_mode kernels.soft_squares
         kernels.reference kernels.matched kernels.gpu_pairs
-        kernels.cpu_limits
+        kernels.cpu_limits kernels.cpu_apart
         kernels.cpu_pairs kernels.cpu_matched kernels.gpu_sweeps kernels.gpu_clouds
         kernels.cpu_clipping
         kernels.cpu_matched_adjoint kernels.cpu_sweeps kernels.cpu_forces kernels.cpu_dual kernels.cpu_dual_forces
         kernels.gpu_forces
+        kernels.cpu_features
+        kernels.cpu_feature_rates
         kernels.cpu_dual_planes kernels.gpu
+        kernels.cpu_kinds
         kernels.cpu_items
         kernels.cpu_batch kernels.cpu_course kernels.cpu_matched_course
         kernels.cpu

@@ -25,11 +25,19 @@ TERMS = {
     "N": SoftTerms(True, True, outlier=1e-3),
     "N, signs as given": SoftTerms(True, True, False, outlier=1e-3),
     "N, clipped": SoftTerms(True, True, False, outlier=1e-3, clip=1.0),
+    "by features": SoftTerms(True, outlier=1e-3, match="features"),
+    "softBD, by both": SoftTerms(True, outlier=1e-10, match="both", feature_weight=0.3),
+    "softBBS, by both": SoftTerms(False, outlier=1e-3, match="both", feature_weight=0.3),
 }
 
 
-def _scene(d, masked, dtype):
-    given = {k: v.to(dtype) for k, v in noisy_pair(d, batch=2, n=70, m=90).items() if "features" not in k}
+def _given(d, by_features, **sizes):
+    return {k: v for k, v in noisy_pair(d, **sizes).items() if by_features or "features" not in k}
+
+
+def _scene(name, d, masked, dtype):
+    by_features = TERMS[name].match != "points"
+    given = {k: v.to(dtype) for k, v in _given(d, by_features, batch=2, n=70, m=90).items()}
     if masked:
         given["P_mask"], given["Q_mask"] = torch.rand(2, 70) > 0.2, torch.rand(2, 90) > 0.2
     pair = CloudPair(**given)
@@ -56,7 +64,7 @@ def _same(found, wanted, tolerance):
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("name", TERMS)
 def test_compiled_sweeps_are_the_reference(name, d, masked, dtype, tolerance):
-    scene, direction = _scene(d, masked, dtype)
+    scene, direction = _scene(name, d, masked, dtype)
     if not cpu.supports(TERMS[name], scene):
         assert masked and name == "N, clipped"
         return
@@ -72,10 +80,10 @@ def test_compiled_sweeps_are_the_reference(name, d, masked, dtype, tolerance):
         _same(f, w, tolerance)
 
 
-@pytest.mark.parametrize("name", ["softBD", "N, clipped"])
+@pytest.mark.parametrize("name", ["softBD", "N, clipped", "softBD, by both"])
 def test_threads_and_parts_change_nothing(name, monkeypatch):
     monkeypatch.setattr(cpu_batch, "PAIRS_PER_PART", 1000)
-    scene, direction = _scene(3, False, torch.float64)
+    scene, direction = _scene(name, 3, False, torch.float64)
     one = Scene(CloudPair(*(None if x is None else x[:1] for x in scene.pair)), *(x[:1] for x in scene[1:]))
     threads, answers = torch.get_num_threads(), []
     for count in (1, 2):
@@ -84,12 +92,14 @@ def test_threads_and_parts_change_nothing(name, monkeypatch):
     torch.set_num_threads(threads)
     for first, second in zip(*answers, strict=True):
         assert torch.equal(first.pair.P, second.pair.P) and torch.equal(first.temperature, second.temperature)
+        if "both" in name:
+            assert torch.equal(first.pair.P_features, second.pair.P_features)
     for found, wanted in zip(answers[0], cpu.directional(TERMS[name], scene, direction), strict=True):
         torch.testing.assert_close(found.pair.Q, wanted.pair.Q[:1], rtol=1e-11, atol=1e-14)
 
 
 def test_coincident_points_have_finite_derivatives():
-    scene, direction = _scene(3, False, torch.float64)
+    scene, direction = _scene("softBD", 3, False, torch.float64)
     pair = scene.pair._replace(Q=scene.pair.P[:, :1].expand(-1, 90, -1).contiguous())
     coincident = Scene(pair, scene.temperature, torch.zeros(2, dtype=torch.float64))
     for f, w in zip(
@@ -135,7 +145,7 @@ def test_compiled_adam_is_adam(d, shared, noise, rng):
     k, free = len(axes), np.isin(np.arange(6), axes).astype(float)
     rates = np.zeros((steps, 6))
     rates[:, axes] = rng.uniform(0.01, 0.1, size=(steps, k))
-    course = cpu_adam.Course(np.ones(steps), rates, free, (0.9, 0.999, 1e-8), shared, 0, noise)
+    course = cpu_adam.Course(np.ones(steps), rates, free, (0.9, 0.999, 1e-8), shared, 0, noise, False)
     shapes = (steps + 1, 3, 3), (steps + 1, 3), (steps + 1, 6), (steps + 1, 6), (steps, 6)
     trace = cpu_adam.Trace(*map(np.zeros, shapes))
     trace.rotations[0] = np.eye(3)
@@ -146,13 +156,13 @@ def test_compiled_adam_is_adam(d, shared, noise, rng):
         trace.gradients[step] *= 1e-3 if step == 2 else 1.0
         gradient = torch.from_numpy(trace.gradients[step : step + 1, axes].copy())
         direction, moments = adam_direction(
-            without_rounding(gradient, noise, k),
+            without_rounding(gradient, torch.tensor([noise]), k),
             moments,
             betas=(0.9, 0.999),
             eps=1e-8,
             blocks=(k - d, d) if shared else None,
         )
-        cpu_adam.advance(course, trace, step)
+        cpu_adam.advance(course, trace, step, 0.0)
         move = torch.zeros(1, 6, dtype=torch.float64)
         move[:, axes] = -torch.from_numpy(rates[step, axes]) * direction
         turn = RigidMotion.from_rotvec(move[:, :3], move[:, 3:])

@@ -53,11 +53,22 @@ def few_steps(folder: Path) -> tuple[list[str], Callable[[str], None]]:
     return ["16"], check
 
 
+def ten_steps(folder: Path) -> tuple[list[str], Callable[[str], None]]:
+    """How many steps learn_features.py takes; by then it registers three times as many of the pairs it has not seen."""
+
+    def check(printed: str) -> None:
+        found = [int(count) for count in re.findall(r"(\d+) of 40 within", printed)]
+        assert found[0] < 13 and found[-1] > 28
+
+    return ["10"], check
+
+
 # Each example with what prepares its arguments and checks its results; a new example needs a row.
 PREPARED = {
     "register_two_files.py": two_files,
     "instead_of_chamfer.py": nothing_needed,
     "learn_what_to_trust.py": few_steps,
+    "learn_features.py": ten_steps,
 }
 
 

@@ -29,14 +29,14 @@ class Moments(NamedTuple):
         return Moments(self.first.detach(), self.second.detach(), self.step)
 
 
-def without_rounding(gradient: Tensor, noise: float, size: int) -> Tensor:
-    """The gradient ``(batch, k)``, the first ``size`` components 0, derivatives too, where no longer than ``noise``.
+def without_rounding(gradient: Tensor, noise: Tensor, size: int) -> Tensor:
+    """The gradient ``(batch, k)``; its first ``size`` components 0, derivatives too, where no longer than the noise.
 
     At an exact optimum, where a pair and its exact copy begin, nothing is left of the gradient but the rounding of its
-    sum. Adam would take a whole step along it, with a derivative of one over it.
+    sum, ``noise (batch,)``. Adam would take a whole step along it, with a derivative of one over it.
     """
     pose, rest = gradient.split((size, gradient.shape[-1] - size), dim=-1)
-    heard = pose.detach().norm(dim=-1, keepdim=True) > noise
+    heard = pose.detach().norm(dim=-1, keepdim=True) > noise[:, None]
     return torch.cat((torch.where(heard, pose, 0.0), rest), dim=-1)
 
 

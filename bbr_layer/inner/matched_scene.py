@@ -8,6 +8,7 @@ from bbr_layer.kernels.cpu_adam import Back, Course, Trace, advance, retreat
 from bbr_layer.kernels.cpu_course import Adjoint
 from bbr_layer.kernels.cpu_matched import matched_clouds, slope_of
 from bbr_layer.kernels.cpu_matched_adjoint import add_adjoint, add_weights
+from bbr_layer.kernels.cpu_matched_course import MEAN
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.pair import CloudPair
 
@@ -35,7 +36,7 @@ class MatchedScene:
         for step, temperature in enumerate(course.temperatures):
             pose = trace.rotations[step], trace.translations[step]
             trace.gradients[step] = slope_of(clouds, self.search.of_item(number, pose), pose, temperature)
-            advance(course, trace, step)
+            advance(course, trace, step, MEAN)
 
     def walk_back(
         self,

@@ -29,6 +29,7 @@ class Problem(NamedTuple):
     inner: Adam | GaussNewton
     squares: BoundSquares | None = None  # the loss as GaussNewton sees it
     noise: float = 0.0  # a gradient by the pose that is no longer than this is rounding
+    summed: bool = False  # whether the loss is a sum over points: the noise is then that times loss over temperature
 
 
 class Progress(NamedTuple):
@@ -79,7 +80,8 @@ def step(problem: Problem, at: Progress, differentiable: bool) -> Progress:
     d = problem.frame.target_centre.shape[-1]
     blocks = (rotation_dimensions(d), d) + ((1,) if learned else ())
     pose_size = blocks[0] + blocks[1]
-    gradient = without_rounding(gradient, problem.noise, pose_size)
+    noise = problem.noise * (loss.detach().abs() / temperature.detach() if problem.summed else torch.ones_like(loss))
+    gradient = without_rounding(gradient, noise, pose_size)
     direction, moments = adam_direction(
         gradient, at.moments, betas=inner.betas, eps=inner.eps, blocks=blocks if inner.shared else None
     )

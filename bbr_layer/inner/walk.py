@@ -47,7 +47,7 @@ class Steps(NamedTuple):
     inner: the optimiser.
     done: steps of this stage taken before.
     seen: the step of this stage before which the pose is also told.
-    noise: as ``Course`` has it.
+    noise, summed: as ``Course`` has them.
     """
 
     look: Callable[[CloudPair, Tensor], Scene]
@@ -55,14 +55,15 @@ class Steps(NamedTuple):
     done: int
     seen: int
     noise: float
+    summed: bool
 
     def course(self, temperatures: Tensor, rates: Tensor, dimension: int) -> Callable[[int], Course]:
         """How each item goes, from ``(steps, batch)`` and ``(steps, k)``."""
         free, axes = np.zeros(6), AXES[dimension]
         free[axes] = 1
         heats, constants = np.ascontiguousarray(temperatures.numpy().T), (*self.inner.betas, self.inner.eps)
-        speeds = _spread(rates, axes)
-        return lambda b: Course(heats[b], speeds, free, constants, self.inner.shared, self.done, self.noise)
+        common = _spread(rates, axes), free, constants, self.inner.shared, self.done, self.noise, self.summed
+        return lambda b: Course(heats[b], *common)
 
 
 class Walked(NamedTuple):
@@ -124,7 +125,7 @@ class _Walk(torch.autograd.Function):
         pair, d, steps = CloudPair._make(fields), translation.shape[-1], ctx.steps
         scene, course = steps.look(pair, rounding), steps.course(temperatures, rates, d)
         (count, batch), axes = temperatures.shape, AXES[d]
-        adjoint = _zero(batch, pair.P.shape[1], pair.Q.shape[1])
+        adjoint = _zero(pair)
         moments = (_spread(x, axes) for x in cotangents[2:4])
         back = Back(matrices_in_space(cotangents[0].numpy(), 0.0), in_space(cotangents[1].numpy()).copy(), *moments)
         heats, speeds = np.zeros((batch, count)), np.zeros((batch, count, 6))
@@ -157,9 +158,11 @@ def _begun(steps: int, rotation: Tensor, translation: Tensor, first: Tensor, sec
     return trace
 
 
-def _zero(batch: int, n: int, m: int) -> Adjoint:
+def _zero(pair: CloudPair) -> Adjoint:
+    (batch, n, _), m = pair.P.shape, pair.Q.shape[1]
     vectors, numbers = ((batch, 3, n), (batch, 3, m)), ((batch, n), (batch, m))
-    return Adjoint(*(np.zeros(shape) for shape in (*vectors, *vectors, *numbers, (batch, 1))))
+    features = [(batch, 0 if x is None else x.shape[-1], k) for x, k in ((pair.P_features, n), (pair.Q_features, m))]
+    return Adjoint(*(np.zeros(shape) for shape in (*vectors, *vectors, *numbers, (batch, 1), *features)))
 
 
 def _item(tables: Tables, number: int) -> Tables:

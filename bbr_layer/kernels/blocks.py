@@ -69,9 +69,8 @@ def _block(terms: SoftTerms, pair: CloudPair, scene: Scene, limit: Tensor | None
 
 def _matched_distances(terms: SoftTerms, pair: CloudPair, squared: Tensor, rounding: Tensor) -> Tensor:
     P, Q = pair.both_features()
-    apart = torch.zeros_like(squared)
-    for p, q in zip(P.unbind(-1), Q.unbind(-1), strict=True):
-        apart = apart + (q[:, None] - p[:, :, None]).square()
+    # By explicit differences, all channels at once: features do not move, so that nothing is differentiated here.
+    apart = torch.cdist(P.detach(), Q.detach(), compute_mode="donot_use_mm_for_euclid_dist").square()
     total = apart * terms.feature_weight**2
     return smooth_root(total + squared if terms.match == "both" else total, rounding)
 

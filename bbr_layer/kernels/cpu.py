@@ -1,9 +1,13 @@
-"""The compiled sweeps behind the interface of ``reference.py``: tensors in, tensors out, nothing of size n x m."""
+"""The compiled sweeps behind the interface of ``reference.py``: tensors in, tensors out.
+
+Nothing is of size n x m but how far features are apart, where buddies are found by them.
+"""
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from bbr_layer.kernels.cpu_apart import MOST_PAIRS, Features
 from bbr_layer.kernels.cpu_batch import DUAL, GRADIENT, Packed, room_for_sums, run_sweeps
 from bbr_layer.kernels.cpu_items import Loss, Normals
 from bbr_layer.kernels.cpu_math import (
@@ -18,6 +22,7 @@ from bbr_layer.kernels.cpu_math import (
     ROUND,
     ROW_OUT,
     SMOOTH,
+    SPACE,
     VELOCITY,
     WEIGHT,
 )
@@ -33,9 +38,14 @@ SMALLEST_OUTLIER = 1e-12
 
 
 def supports(terms: SoftTerms, scene: Scene) -> bool:
-    """Whether the compiled sweeps can do it: found by distances, with an epsilon, clipped without padding only."""
-    padded = scene.pair.P_mask is not None or scene.pair.Q_mask is not None
-    return terms.match == "points" and not (terms.clip and padded) and terms.outlier >= SMALLEST_OUTLIER
+    """Whether the compiled sweeps can do it: with an epsilon, clipped without padding only, features if not too many.
+
+    Distances of features are held for all pairs of an item.
+    """
+    pair = scene.pair
+    padded = pair.P_mask is not None or pair.Q_mask is not None
+    held = terms.match == "points" or pair.P.shape[1] * pair.Q.shape[1] <= MOST_PAIRS
+    return held and not (terms.clip and padded) and terms.outlier >= SMALLEST_OUTLIER
 
 
 def loss_of(terms: SoftTerms) -> Loss:
@@ -47,17 +57,19 @@ def gradient(terms: SoftTerms, scene: Scene) -> tuple[Tensor, Scene]:
     """As ``reference.soft_gradient``."""
     packed = pack(terms, scene)
     losses = run_sweeps(GRADIENT, packed, loss_of(terms))
-    return torch.from_numpy(losses), _unpacked(scene, packed, 0)
+    return torch.from_numpy(losses), _with_features(_unpacked(scene, packed, 0), terms, packed)
 
 
 def directional(terms: SoftTerms, scene: Scene, direction: Direction) -> tuple[Scene, Scene]:
     """As ``reference.soft_directional``."""
     packed = pack(terms, scene, direction)
     run_sweeps(DUAL, packed, loss_of(terms))
-    gradient, rates = _unpacked(scene, packed, 0), _unpacked(scene, packed, 1)
+    found, rates = _unpacked(scene, packed, 0), _with_features(_unpacked(scene, packed, 1), terms, packed)
+    if packed.features is not None:  # the sweeps add up their rates alone
+        found = gradient(terms, scene)[1]
     # The derivative by the temperature has alpha^2 below it, which changes too.
-    cooling = 2 * gradient.temperature * direction.temperature / scene.temperature
-    return gradient, rates._replace(temperature=rates.temperature - cooling)
+    cooling = 2 * found.temperature * direction.temperature / scene.temperature
+    return found, rates._replace(temperature=rates.temperature - cooling)
 
 
 def pack(terms: SoftTerms, scene: Scene, direction: Direction | None = None) -> Packed:
@@ -79,10 +91,28 @@ def pack(terms: SoftTerms, scene: Scene, direction: Direction | None = None) -> 
     constants[:, SMOOTH] = scene.rounding.detach().numpy() ** 2
     constants[:, COOL] = 1 / scene.temperature.detach().numpy()
     constants[:, ALIGN] = float(terms.align_signs)
+    constants[:, SPACE] = float(terms.match == "both")
     if direction is not None:
         constants[:, COOL_RATE] = (direction.temperature / scene.temperature).detach().numpy()
     room = room_for_sums(len(rows), rows.shape[2], columns.shape[2])
-    return Packed((rows, columns), normals, *room, constants)
+    features = None if terms.match == "points" else _features(pair, terms.feature_weight)
+    return Packed((rows, columns), normals, features, *room, constants)
+
+
+def _features(pair: CloudPair, weight: float) -> Features:
+    f, g = (weight * x.detach().numpy() for x in pair.both_features())
+    padded = [None if mask is None else ~mask.numpy() for mask in (pair.P_mask, pair.Q_mask)]
+    room = (np.zeros(x.shape) for x in (f, g))
+    return Features(f, np.ascontiguousarray(g.transpose(0, 2, 1)), (padded[0], padded[1]), *room)
+
+
+def _with_features(found: Scene, terms: SoftTerms, packed: Packed) -> Scene:
+    """The same with the derivatives by features, which the sweeps leave aside."""
+    if packed.features is None:
+        return found
+    by_P, by_Q = (terms.feature_weight * torch.from_numpy(x) for x in (packed.features.by_P, packed.features.by_Q))
+    dtype = found.pair.P.dtype
+    return found._replace(pair=found.pair._replace(P_features=by_P.to(dtype), Q_features=by_Q.to(dtype)))
 
 
 def _side(points: Tensor, weights: Tensor | None, mask: Tensor | None, channels: int) -> np.ndarray:

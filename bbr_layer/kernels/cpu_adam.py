@@ -25,6 +25,7 @@ class Course(NamedTuple):
     shared: whether rotation and translation each share one second moment.
     done: steps taken before.
     noise: a gradient no longer than this is rounding, and counts as 0.
+    summed: whether the loss is a sum over points; ``noise`` is then over its value and times the temperature.
     """
 
     temperatures: np.ndarray
@@ -34,6 +35,7 @@ class Course(NamedTuple):
     shared: bool
     done: int
     noise: float
+    summed: bool
 
 
 class Trace(NamedTuple):
@@ -88,15 +90,16 @@ def _turn(rates, direction):  # type: ignore[no-untyped-def]
 
 # Loops instead of expressions of arrays: compiling those takes seconds more, most of them for the words of errors.
 @exact
-def advance(course, trace, step):  # type: ignore[no-untyped-def]
+def advance(course, trace, step, loss):  # type: ignore[no-untyped-def]
     """From point ``step`` of the trace, along the gradient there, to the next point; rounding is taken off it."""
+    noise = course.noise * (abs(loss) / course.temperatures[step] if course.summed else 1.0)
     fast, slow, _ = course.constants
     gradient, first, second = trace.gradients[step], trace.firsts[step + 1], trace.seconds[step + 1]
     squares = np.empty(6)
     for k in range(6):
         gradient[k] *= course.free[k]
         squares[k] = gradient[k] * gradient[k]
-    if squares.sum() <= course.noise * course.noise:
+    if squares.sum() <= noise * noise:
         gradient[:], squares[:] = 0.0, 0.0
     _mean_in_blocks(squares, course.free, course.shared)
     for k in range(6):

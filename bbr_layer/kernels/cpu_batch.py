@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_apart import Apart, Features, Pulled
 from bbr_layer.kernels.cpu_clipping import settle_limit
-from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
-from bbr_layer.kernels.cpu_dual_planes import force_rates
-from bbr_layer.kernels.cpu_forces import forces
 from bbr_layer.kernels.cpu_items import (
+    Beside,
     Both,
     Loss,
     Normals,
@@ -24,8 +23,8 @@ from bbr_layer.kernels.cpu_items import (
     settle_buddies,
     settle_denominators,
 )
+from bbr_layer.kernels.cpu_kinds import DUAL_SWEEPS, GRADIENT_SWEEPS
 from bbr_layer.kernels.cpu_math import COLUMN_OUT, KEPT_PAIRS, ROW_OUT
-from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators
 from bbr_layer.threads import side_by_side
 
 # A single item is cut into at most this many parts, of at least this many pairs each.
@@ -39,34 +38,43 @@ class Sweeps(NamedTuple):
 
     Parameters
     ----------
-    kept: how many numbers of a pair are kept from the first sweep for the others, for points and for planes.
+    kept: how many numbers of a pair are kept from the first sweep for the others, for points, for planes and where
+        buddies are found by features.
     """
 
     parts: tuple[Callable, Callable, Callable]
     whole: Callable
     rates: bool
-    kept: tuple[int, int]
+    kept: tuple[int, int, int]
 
 
-GRADIENT = Sweeps((denominators, buddy_sums, forces), item_gradient, False, (2, 2))
+GRADIENT = Sweeps(GRADIENT_SWEEPS, item_gradient, False, (2, 2, 2))
 # For planes, loading what was kept is no faster than computing it again (measured at 500 and 1000 points).
-DUAL = Sweeps((denominator_rates, buddy_sum_rates, force_rates), item_rates, True, (3, 0))
+DUAL = Sweeps(DUAL_SWEEPS, item_rates, True, (3, 0, 2))
 
 
 class Packed(NamedTuple):
-    """A batch of ``Tables``: the same fields with the batch before them."""
+    """A batch of ``Tables``: the same fields with the batch before them; normals, features or neither."""
 
     sides: Both
     normals: Normals
+    features: Features | None
     sums: Both
     shares: Both
     constants: np.ndarray
 
-    def item(self, b: int) -> Tables:
-        """Item ``b``."""
+    def item(self, b: int, pulled: bool = True) -> Tables:
+        """Item ``b``; ``pulled`` where somebody asks for the derivative by its features."""
         sides, sums, shares = ((x[0][b], x[1][b]) for x in (self.sides, self.sums, self.shares))
-        normals = None if self.normals is None else tuple(x[b] for x in self.normals)
-        return Tables(sides, normals, sums, shares, self.constants[b])
+        beside: Beside = None if self.normals is None else tuple(x[b] for x in self.normals)
+        if self.features is not None:
+            beside = self.features.pulled(b) if pulled else self.features.apart(b)
+        return Tables(sides, beside, sums, shares, self.constants[b])
+
+    def settle(self, b: int, tables: Tables) -> None:
+        """Take what was pulled of item ``b`` back to its features."""
+        if self.features is not None and isinstance(tables.beside, Pulled):
+            self.features.take_back(b, tables.beside.pull)
 
 
 def room_for_sums(batch: int, n: int, m: int) -> tuple[Both, Both]:
@@ -78,7 +86,8 @@ def room_for_sums(batch: int, n: int, m: int) -> tuple[Both, Both]:
 def room_to_keep(sweeps: Sweeps, tables: Tables) -> Kept:
     """What the first sweep of an item may keep for the others; None where that is nothing, or would be too much."""
     rows, columns = tables.sides
-    count = sweeps.kept[tables.normals is not None]
+    by_features = isinstance(tables.beside, Apart | Pulled)
+    count = sweeps.kept[2 if by_features else int(tables.beside is not None)]
     if not count or rows.shape[1] * columns.shape[1] > KEPT_PAIRS:
         return None
     return tuple(np.empty((rows.shape[1], columns.shape[1]), rows.dtype) for _ in range(count))
@@ -97,7 +106,9 @@ def run_sweeps(sweeps: Sweeps, packed: Packed, loss: Loss) -> np.ndarray:
     losses = np.zeros(len(packed.constants))
 
     def work(b: int) -> None:
-        losses[b] = run_item(sweeps, packed.item(b), None, loss, len(losses))
+        tables = packed.item(b)
+        losses[b] = run_item(sweeps, tables, None, loss, len(losses))
+        packed.settle(b, tables)
 
     side_by_side(work, len(losses))
     return losses
@@ -109,7 +120,7 @@ def run_item(sweeps: Sweeps, tables: Tables, kept: Kept, loss: Loss, batch: int)
     parts = parts_of(batch, n, m)
     if parts == 1:
         return sweeps.whole(tables, kept, loss)
-    settle_limit(tables.sides, tables.normals, tables.constants, loss.clip)
+    settle_limit(tables.sides, tables.beside, tables.constants, loss.clip)
     spans = [slice(n * number // parts, n * (number + 1) // parts) for number in range(parts)]
     _in_parts(sweeps.parts[0], tables, kept, spans)
     settle_denominators(tables, loss, sweeps.rates)
@@ -128,8 +139,14 @@ def _in_parts(sweep: Callable, tables: Tables, kept: Kept, spans: list[slice]) -
 
 
 def _part(sweep: Callable, tables: Tables, kept: Kept, cut: tuple[list[slice], np.ndarray], number: int) -> None:
-    (rows, columns), normals, span = tables.sides, tables.normals, cut[0][number]
-    shown = None if normals is None else (normals[0][:, span], *normals[1:])
+    (rows, columns), span = tables.sides, cut[0][number]
     out = tables.sums[0][:, span], cut[1][number]
     own = None if kept is None else tuple(table[span] for table in kept)
-    sweep((rows[:, span], columns), shown, out, tables.constants, own)
+    sweep((rows[:, span], columns), _beside_rows(tables.beside, span), out, tables.constants, own)
+
+
+def _beside_rows(beside: Beside, span: slice) -> Beside:
+    """What stands beside some of the rows."""
+    if isinstance(beside, Apart | Pulled):
+        return type(beside)(*(table[span] for table in beside))
+    return None if beside is None else (beside[0][:, span], *beside[1:])

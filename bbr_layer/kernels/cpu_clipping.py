@@ -46,6 +46,6 @@ def _settle_limit(sides, normals, constants, clip):  # type: ignore[no-untyped-d
 
 @overload(settle_limit)
 def _chosen(sides, normals, constants, clip):  # type: ignore[no-untyped-def]
-    if normals == types.none or len(normals) == 2:
+    if normals == types.none or len(normals) != 3:
         return lambda sides, normals, constants, clip: None
     return lambda sides, normals, constants, clip: _settle_limit(sides, normals, constants, clip)

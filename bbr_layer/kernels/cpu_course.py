@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bbr_layer.kernels.cpu_adam import advance, retreat
+from bbr_layer.kernels.cpu_apart import normals_of
 from bbr_layer.kernels.cpu_compiling import exact
 from bbr_layer.kernels.cpu_items import Loss, Tables, item_gradient, item_rates
 from bbr_layer.kernels.cpu_math import COLUMN_OUT, COOL, HEAT, ROUND, ROW_OUT, VELOCITY
@@ -41,7 +42,10 @@ class Scene(NamedTuple):
 
 
 class Adjoint(NamedTuple):
-    """Where cotangents of one item are added up: ``(3, n)``, ``(3, m)``, normals alike, weights, rounding ``(1,)``."""
+    """Where cotangents of one item are added up: ``(3, n)``, ``(3, m)``, normals alike, weights, rounding ``(1,)``.
+
+    Those of features, ``(c, n)`` and ``(c, m)``, are put there when all steps are done.
+    """
 
     P: np.ndarray
     Q: np.ndarray
@@ -50,6 +54,8 @@ class Adjoint(NamedTuple):
     P_weights: np.ndarray
     Q_weights: np.ndarray
     rounding: np.ndarray
+    P_features: np.ndarray
+    Q_features: np.ndarray
 
 
 @exact
@@ -146,7 +152,7 @@ def spread(cloud, sums, shares, moved, out):  # type: ignore[no-untyped-def]
 @exact
 def look(scene, pose, temperature):  # type: ignore[no-untyped-def]
     """Place the source, and set the temperature."""
-    place(scene.cloud, scene.tables.sides[1], scene.tables.normals, pose)
+    place(scene.cloud, scene.tables.sides[1], normals_of(scene.tables.beside), pose)
     scene.tables.constants[COOL] = 1 / temperature
 
 
@@ -156,9 +162,9 @@ def walk(scene, course, trace):  # type: ignore[no-untyped-def]
     for step in range(len(course.temperatures)):
         pose = trace.rotations[step], trace.translations[step]
         look(scene, pose, course.temperatures[step])
-        item_gradient(scene.tables, scene.kept, scene.loss)
+        loss = item_gradient(scene.tables, scene.kept, scene.loss)
         torque_and_force(scene.cloud, scene.tables.sums[1], pose, trace.gradients[step])
-        advance(course, trace, step)
+        advance(course, trace, step, loss)
 
 
 @exact
@@ -172,6 +178,6 @@ def walk_back(scene, course, trace, out, by_course):  # type: ignore[no-untyped-
         along = retreat(course, trace, step, out[0], by_course[1])
         pose, temperature = (trace.rotations[step], trace.translations[step]), course.temperatures[step]
         look(scene, pose, temperature)
-        set_going(scene.cloud, tables.sides[1], tables.normals, pose, along)
+        set_going(scene.cloud, tables.sides[1], normals_of(tables.beside), pose, along)
         item_rates(tables, scene.kept, scene.loss)
         by_course[0][step] = spread(scene.cloud, tables.sums, tables.shares, (pose, along), out) / temperature**2

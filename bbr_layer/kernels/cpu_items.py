@@ -4,11 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bbr_layer.kernels.cpu_apart import Apart, Pulled
 from bbr_layer.kernels.cpu_clipping import settle_limit
 from bbr_layer.kernels.cpu_compiling import compiled
-from bbr_layer.kernels.cpu_dual import buddy_sum_rates, denominator_rates
-from bbr_layer.kernels.cpu_dual_planes import force_rates
-from bbr_layer.kernels.cpu_forces import forces
+from bbr_layer.kernels.cpu_kinds import DUAL_SWEEPS, GRADIENT_SWEEPS
 from bbr_layer.kernels.cpu_math import (
     BY_M,
     BY_M_RATE,
@@ -20,10 +19,13 @@ from bbr_layer.kernels.cpu_math import (
     SHARE_RATE,
     WEIGHT,
 )
-from bbr_layer.kernels.cpu_sweeps import buddy_sums, denominators
 
 Both = tuple[np.ndarray, np.ndarray]
 Normals = tuple[np.ndarray, ...] | None
+Beside = Normals | Apart | Pulled
+# By name, as Numba knows them.
+_denominators, _buddy_sums, _forces = GRADIENT_SWEEPS
+_denominator_rates, _buddy_sum_rates, _force_rates = DUAL_SWEEPS
 
 
 class Loss(NamedTuple):
@@ -40,14 +42,15 @@ class Tables(NamedTuple):
     Parameters
     ----------
     sides: ``(channels, n)`` and ``(channels, m)``, see ``cpu_math``.
-    normals: ``(3, n)`` and ``(6, m)``, and the limit ``(1,)`` of a loss that clips; or None.
+    beside: normals, ``(3, n)`` and ``(6, m)``, and the limit ``(1,)`` of a loss that clips; or how far features are
+        apart; or None.
     sums: float64 ``(16, n)`` and ``(12, m)``, values before rates, as ``forces`` and its kin fill them.
     shares: float64 ``(2, n)`` and ``(2, m)``: the loss per unit of weight of each point, and its rate.
     constants: ``(c,)``.
     """
 
     sides: Both
-    normals: Normals
+    beside: Beside
     sums: Both
     shares: Both
     constants: np.ndarray
@@ -137,24 +140,24 @@ def item_gradient(tables, kept, loss):  # type: ignore[no-untyped-def]
 
     ``kept`` is room for what the first sweep keeps, or None.
     """
-    sides, normals, sums, constants = tables.sides, tables.normals, tables.sums, tables.constants
-    settle_limit(sides, normals, constants, loss.clip)
-    denominators(sides, normals, cleared(sums), constants, kept)
+    sides, beside, sums, constants = tables.sides, tables.beside, tables.sums, tables.constants
+    settle_limit(sides, beside, constants, loss.clip)
+    _denominators(sides, beside, cleared(sums), constants, kept)
     settle_denominators(tables, loss, False)
-    buddy_sums(sides, normals, cleared(sums), constants, kept)
+    _buddy_sums(sides, beside, cleared(sums), constants, kept)
     value = settle_buddies(tables, loss, False)
-    forces(sides, normals, cleared(sums), constants, kept)
+    _forces(sides, beside, cleared(sums), constants, kept)
     return value
 
 
 @compiled()
 def item_rates(tables, kept, loss):  # type: ignore[no-untyped-def]
     """The same and the rates of change of all of it."""
-    sides, normals, sums, constants = tables.sides, tables.normals, tables.sums, tables.constants
-    settle_limit(sides, normals, constants, loss.clip)
-    denominator_rates(sides, normals, cleared(sums), constants, kept)
+    sides, beside, sums, constants = tables.sides, tables.beside, tables.sums, tables.constants
+    settle_limit(sides, beside, constants, loss.clip)
+    _denominator_rates(sides, beside, cleared(sums), constants, kept)
     settle_denominators(tables, loss, True)
-    buddy_sum_rates(sides, normals, cleared(sums), constants, kept)
+    _buddy_sum_rates(sides, beside, cleared(sums), constants, kept)
     value = settle_buddies(tables, loss, True)
-    force_rates(sides, normals, cleared(sums), constants, kept)
+    _force_rates(sides, beside, cleared(sums), constants, kept)
     return value

@@ -11,12 +11,12 @@ from bbr_layer.kernels.cpu_math import ZERO
 
 def limit_of(normals: Any) -> Any:
     """The square at which distances are clipped, kept behind the normals; None where none are."""
-    return None if normals is None or len(normals) == 2 else normals[2][0]
+    return None if normals is None or len(normals) != 3 else normals[2][0]
 
 
 @overload(limit_of, inline="always")
 def _limit_of(normals):  # type: ignore[no-untyped-def]
-    if normals == types.none or len(normals) == 2:
+    if normals == types.none or len(normals) != 3:
         return lambda normals: None
     return lambda normals: normals[2][0]
 

@@ -8,6 +8,9 @@ from bbr_layer.kernels.cpu_matched import slope_of
 from bbr_layer.kernels.cpu_matched_adjoint import add_adjoint, add_weights
 from bbr_layer.kernels.cpu_mutual import mutual_pairs
 
+# F is a mean: what is rounding in its gradient does not hang on its value.
+MEAN = 0.0
+
 
 @exact
 def _pairs(search, pose, index, mutual, counts):  # type: ignore[no-untyped-def]
@@ -38,7 +41,7 @@ def walk(clouds, search, course, trace):  # type: ignore[no-untyped-def]
         slope = slope_of(clouds, (index, mutual), pose, course.temperatures[step])
         for k in range(len(slope)):
             trace.gradients[step, k] = slope[k]
-        advance(course, trace, step)
+        advance(course, trace, step, MEAN)
     return counts
 
 

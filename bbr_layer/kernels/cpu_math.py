@@ -28,8 +28,8 @@ VELOCITY, COLUMN_CHANNELS = 8, 11
 HEAT, ROUND = 6, 7
 ROW_OUT, COLUMN_OUT = 8, 6
 # Constants of an item: smoothing squared, 1 / alpha, derivatives of the loss by S and by M, 1 to align signs; then the
-# rates of change of alpha over alpha and of the two derivatives.
-SMOOTH, COOL, BY_S, BY_M, ALIGN, COOL_RATE, BY_S_RATE, BY_M_RATE, CONSTANTS = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# rates of change of alpha over alpha and of the two derivatives; then 1 where coordinates count beside features.
+SMOOTH, COOL, BY_S, BY_M, ALIGN, COOL_RATE, BY_S_RATE, BY_M_RATE, SPACE, CONSTANTS = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
 
 F32 = np.float32
 LOG2_E = F32(1 / math.log(2))

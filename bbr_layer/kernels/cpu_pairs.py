@@ -51,6 +51,8 @@ def _kept_row(kept, i, first, last):  # type: ignore[no-untyped-def]
     # Chosen by type: what is sometimes None and sometimes not has no compiled type.
     if kept == types.none:
         return lambda kept, i, first, last: None
+    if len(kept) == 1:
+        return lambda kept, i, first, last: (kept[0][i, first:last],)
     if len(kept) == 2:
         return lambda kept, i, first, last: (kept[0][i, first:last], kept[1][i, first:last])
     return lambda kept, i, first, last: (kept[0][i, first:last], kept[1][i, first:last], kept[2][i, first:last])
@@ -142,15 +144,22 @@ def plane_square_rate(motion, normals, align, limit):  # type: ignore[no-untyped
 
 
 @compiled(forceinline=True)
-def slope(e, distance, row, column, loss):  # type: ignore[no-untyped-def]
-    """Derivatives of the loss by u = -D / alpha of this pair, and by its distance.
+def slope_parts(e, distance, row, column, loss):  # type: ignore[no-untyped-def]
+    """Derivatives of the loss by the logit u of this pair, and by its distance while its buddies are held.
 
     ``row`` and ``column`` are (weight, inverse denominator, share), ``loss`` is (1 / alpha, by S, by M).
     """
     r, c = share_of(e, row[1]), share_of(e, column[1])
     buddies = row[0] * column[0] * r * c
     by_logit = TWO * (loss[1] + loss[2] * distance) * buddies - r * row[2] - c * column[2]
-    return by_logit, loss[2] * buddies - by_logit * loss[0]
+    return by_logit, loss[2] * buddies
+
+
+@compiled(forceinline=True)
+def slope(e, distance, row, column, loss):  # type: ignore[no-untyped-def]
+    """The same where u = -D / alpha: by the logit, and by the distance through both."""
+    by_logit, held = slope_parts(e, distance, row, column, loss)
+    return by_logit, held - by_logit * loss[0]
 
 
 @compiled(forceinline=True)
@@ -160,8 +169,8 @@ def logit_rate(distance, distance_rate, cool, cool_rate):  # type: ignore[no-unt
 
 
 @compiled(forceinline=True)
-def slope_rate(at, rates, row, column, loss):  # type: ignore[no-untyped-def]
-    """Rates of change of what ``slope`` answers, after the two themselves.
+def slope_part_rates(at, rates, row, column, loss):  # type: ignore[no-untyped-def]
+    """Rates of change of what ``slope_parts`` answers, after the two themselves.
 
     ``at`` is (e, distance), ``rates`` (of the logit, of the distance). ``row`` and ``column`` go on with the rates of
     change of the denominator (relative) and of the share; ``loss`` with those of alpha (relative), by S and by M.
@@ -176,6 +185,12 @@ def slope_rate(at, rates, row, column, loss):  # type: ignore[no-untyped-def]
     by_logit = TWO * value * buddies - r * row[2] - c * column[2]
     by_logit_rate = TWO * (value_rate * buddies + value * buddies_rate)
     by_logit_rate -= r * (r_rate * row[2] + row[4]) + c * (c_rate * column[2] + column[4])
-    by_distance = loss[2] * buddies - by_logit * loss[0]
-    by_distance_rate = loss[5] * buddies + loss[2] * buddies_rate - (by_logit_rate - by_logit * loss[3]) * loss[0]
-    return by_logit, by_distance, by_logit_rate, by_distance_rate
+    return by_logit, loss[2] * buddies, by_logit_rate, loss[5] * buddies + loss[2] * buddies_rate
+
+
+@compiled(forceinline=True)
+def slope_rate(at, rates, row, column, loss):  # type: ignore[no-untyped-def]
+    """Rates of change of what ``slope`` answers, after the two themselves; arguments as for their parts."""
+    by_logit, held, by_logit_rate, held_rate = slope_part_rates(at, rates, row, column, loss)
+    by_distance_rate = held_rate - (by_logit_rate - by_logit * loss[3]) * loss[0]
+    return by_logit, held - by_logit * loss[0], by_logit_rate, by_distance_rate

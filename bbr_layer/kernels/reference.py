@@ -75,34 +75,34 @@ class _Collected:
             self._features(block.pair, matched * terms.feature_weight**2)
             spatial = spatial + matched if terms.match == "both" else spatial
         if block.normals is None or block.residual is None:
-            self._along("", spatial, block.offsets)
+            self._along(spatial, block.offsets)
             return
         force = spatial * block.residual
-        self._along("", force, block.normals)
+        self._along(force, block.normals)
         pushed = [force * x for x in block.offsets]
-        self._put("Q_normals", [x.sum(1) for x in pushed])
-        self._row("P_normals", [(x * block.signs).sum(2) for x in pushed])
+        self._put("Q_normals", torch.stack([x.sum(1) for x in pushed], -1))
+        self._row("P_normals", torch.stack([(x * block.signs).sum(2) for x in pushed], -1))
 
     def _round(self, over_distance: Tensor) -> None:
         self.rounding = self.rounding + self.scene_given.rounding * over_distance.sum((-1, -2), dtype=torch.float64)
 
-    def _along(self, suffix: str, factor: Tensor, directions: list[Tensor]) -> None:
+    def _along(self, factor: Tensor, directions: list[Tensor]) -> None:
         forces = [factor * x for x in directions]
-        self._row("P" + suffix, [-x.sum(2) for x in forces])
-        self._put("Q" + suffix, [x.sum(1) for x in forces])
+        self._row("P", torch.stack([-x.sum(2) for x in forces], -1))
+        self._put("Q", torch.stack([x.sum(1) for x in forces], -1))
 
     def _features(self, pair: CloudPair, factor: Tensor) -> None:
         P, Q = pair.P_features, pair.Q_features
         assert P is not None and Q is not None  # _matched_distances has asked for them
-        channels = zip(P.unbind(-1), Q.unbind(-1), strict=True)
-        self._along("_features", factor, [q[:, None] - p[:, :, None] for p, q in channels])
+        P, Q, pulls = P.double(), Q.double(), factor.double()  # differences of products: precision is lost in them
+        self._row("P_features", (pulls.sum(2)[..., None] * P - pulls @ Q).to(factor.dtype))
+        self._put("Q_features", (pulls.sum(1)[..., None] * Q - pulls.mT @ P).to(factor.dtype))
 
-    def _row(self, name: str, parts: list[Tensor]) -> None:
-        self.rows.setdefault(name, []).append(torch.stack(parts, -1))
+    def _row(self, name: str, values: Tensor) -> None:
+        self.rows.setdefault(name, []).append(values)
 
-    def _put(self, name: str, parts: list[Tensor]) -> None:
-        stacked = torch.stack(parts, -1)
-        self.columns[name] = self.columns[name] + stacked if name in self.columns else stacked
+    def _put(self, name: str, values: Tensor) -> None:
+        self.columns[name] = self.columns[name] + values if name in self.columns else values
 
     def scene(self, row_shares: Tensor, column_shares: Tensor) -> Scene:
         """The gradient; the derivatives by weights are the shares of rows and columns."""
