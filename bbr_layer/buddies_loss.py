@@ -85,7 +85,7 @@ class BestBuddiesLoss(nn.Module):
         return self._of(given)
 
     def _of(self, given: CloudPair) -> Tensor:
-        if is_transformed(given, None):
+        if is_transformed(given):
             raise RuntimeError(
                 "BestBuddiesLoss does not go through torch.func: use torch.autograd.grad, and batches for vmap"
             )

@@ -7,6 +7,8 @@ from torch import Tensor
 FEWEST_POINTS = 2
 # How far R R^T may be from the identity: files hold 6 digits.
 ROTATION_TOLERANCE = 1e-3
+# How far the length of a normal may be from 1: those that files hold in a byte per axis are off by a few percent.
+UNIT_TOLERANCE = 0.05
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
@@ -48,7 +50,7 @@ def check_same_kind(named: dict[str, Tensor | None]) -> None:
             raise ValueError(f"{wrong} is a {type(named[wrong]).__name__}; the layer takes tensors: torch.as_tensor")
         if values.device != P.device:
             raise ValueError(f"{name} is on {values.device} and P on {P.device}: move one, {name}.to(P.device)")
-        if values.dtype not in (P.dtype, torch.bool):
+        if values.dtype != P.dtype and not (values.dtype == torch.bool and name.endswith("_mask")):
             one, other = (name, "P") if P.is_floating_point() else ("P", name)
             raise ValueError(f"{name} has dtype {values.dtype} and P {P.dtype}: convert one, {one}.to({other}.dtype)")
 
@@ -77,18 +79,22 @@ def check_companion(name: str, values: Tensor | None, points: Tensor, *, trailin
 
 
 def check_normals(name: str, normals: Tensor | None, points: Tensor, mask: Tensor | None) -> None:
-    """Refuse normals of another shape, not finite, or zero, as files without normals often hold."""
+    """Refuse normals of another shape, not finite, not of length 1, or zero, as files without normals often hold."""
     check_companion(name, normals, points, trailing=True)
     if normals is None:
         return
     if normals.shape != points.shape:
         raise ValueError(f"{name} has shape {tuple(normals.shape)}; expected {tuple(points.shape)}, one per point")
     check_finite(name, normals, mask)
-    zero = normals.detach().abs().amax(-1) == 0
-    if mask is not None:
-        zero = zero & mask
-    if zero.any():
-        raise ValueError(f"{name} holds {int(zero.sum())} zero vectors: leave it out and normals are estimated")
+    lengths = normals.detach().double().norm(dim=-1)
+    lengths = lengths if mask is None else torch.where(mask, lengths, 1.0)
+    if (lengths == 0).any():
+        count = int((lengths == 0).sum())
+        raise ValueError(f"{name} holds {count} zero vectors: leave it out and normals are estimated")
+    least, most = float(lengths.min()), float(lengths.max())
+    if least < 1 - UNIT_TOLERANCE or most > 1 + UNIT_TOLERANCE:
+        hint = f"try torch.nn.functional.normalize({name}, dim=-1)"
+        raise ValueError(f"{name} has lengths from {least:.3g} to {most:.3g}; normals have length 1: {hint}")
 
 
 def check_weights(name: str, weights: Tensor | None, points: Tensor, mask: Tensor | None) -> None:

@@ -1,23 +1,22 @@
 """One KD-tree per cloud, whoever asks: spacing, normals, starts and every stage search the same points."""
 
+import numpy as np
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from bbr_layer.trees import Tree
 
-# Of every tensor that is searched: how often it had been written to, and the trees of its items.
+# Of every tensor that is searched, the trees of its items.
 _KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def tree_of(points: Tensor, number: int) -> Tree:
-    """The tree over item ``number`` of ``points (batch, n, d)``, on the CPU; kept while the tensor lives unchanged."""
-    item = points[number].detach().double().numpy()
-    if points.is_inference():  # counts no writing
-        return Tree(item)
-    version, trees = _KNOWN.get(points, (None, {}))
-    if version != points._version:
-        version, trees = points._version, {}
-        _KNOWN[points] = version, trees
-    if number not in trees:
-        trees[number] = Tree(item)
-    return trees[number]
+    """The tree over item ``number`` of ``points (batch, n, d)``, on the CPU; kept while the tensor lives unchanged.
+
+    The numbers themselves are compared: what is written through numpy or ``.data`` is counted nowhere.
+    """
+    item, trees = points[number].detach().double().numpy(), _KNOWN.setdefault(points, {})
+    known = trees.get(number)
+    if known is None or not np.array_equal(known.points, item):
+        known = trees[number] = Tree(item.copy())
+    return known

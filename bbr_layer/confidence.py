@@ -4,6 +4,7 @@ Right means: rotation at most 5 degrees off, and the source's points at most 5 p
 from where they belong, on average. How well it is calibrated: docs/trust.md.
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -21,6 +22,9 @@ JUDGED_POINTS = 2000
 # not farther apart than so many spacings. Chosen among 0.25, 0.5, 1 and 2.
 ON_PLANE = 0.5
 NEAR = 2.0
+# Distinct points of the smaller cloud that the calibration begins with. Of k fewer the probability is at most k over
+# this: a handful of points fits nearly anything closely, and all three shares may be 1 by chance.
+FULLY_JUDGED = 100
 # Logistic regression: of 1, share of the smaller cloud with a buddy, share of pairs on one plane, share of them near.
 # `python -m benchmarks.reliability` fits them.
 COEFFICIENTS = (-75.91, 19.45, 40.96, 36.26)
@@ -30,9 +34,11 @@ COEFFICIENTS = (-75.91, 19.45, 40.96, 36.26)
 def judged_clouds(pair: CloudPair) -> CloudPair:
     """At most 2000 points of each cloud, spread evenly, and their normals; those given, where all points are judged.
 
-    Normals of a dense cloud follow its noise; those of the judged points are like those of the fit.
+    Of points in one place one is judged: the others are no evidence of their own, and no measure of spacing. Normals
+    of a dense cloud follow its noise; those of the judged points are like those of the fit.
     """
     thin = thinned_pair(pair._replace(P_features=None, Q_features=None), JUDGED_POINTS)
+    thin = thin._replace(P_mask=_distinct(thin.P, thin.P_mask), Q_mask=_distinct(thin.Q, thin.Q_mask))
     P_normals, Q_normals = (
         kept if few.shape[1] == all_points.shape[1] else None
         for few, all_points, kept in ((thin.P, pair.P, pair.P_normals), (thin.Q, pair.Q, pair.Q_normals))
@@ -49,6 +55,8 @@ def judged_clouds(pair: CloudPair) -> CloudPair:
 def confidence(pair: CloudPair, found: Matches) -> Float[Tensor, "batch"]:
     """Probability that the answer is right, in [0, 1], float64; 0 where no two points are buddies.
 
+    At most k / 100 where the smaller cloud has k < 100 distinct points.
+
     Parameters
     ----------
     pair: as ``judged_clouds`` has it.
@@ -57,7 +65,8 @@ def confidence(pair: CloudPair, found: Matches) -> Float[Tensor, "batch"]:
     shares = statistics(pair, found)
     weights = torch.tensor(COEFFICIENTS, dtype=torch.float64, device=shares.device)
     probability = torch.sigmoid(weights[0] + shares @ weights[1:])
-    return torch.where(found.mutual.any(-1), torch.nan_to_num(probability, nan=0.0), 0.0)
+    most = (torch.minimum(*pair.real_counts()).double() / FULLY_JUDGED).clamp(max=1.0)
+    return torch.where(found.mutual.any(-1), torch.nan_to_num(probability, nan=0.0).minimum(most), 0.0)
 
 
 @torch.no_grad()
@@ -71,13 +80,23 @@ def statistics(pair: CloudPair, found: Matches) -> Float[Tensor, "batch 3"]:
     on_plane = (found.offsets * normals).sum(-1).abs() <= ON_PLANE * spacing
     near = torch.linalg.vector_norm(found.offsets, dim=-1) <= NEAR * spacing
     pairs = found.mutual.sum(-1)
-    smaller = torch.minimum(_count(pair.P, pair.P_mask), _count(pair.Q, pair.Q_mask))
+    smaller = torch.minimum(*pair.real_counts())
     shares = [(found.mutual & which).sum(-1) / pairs.clamp(min=1) for which in (on_plane, near)]
     return torch.stack((pairs / smaller.clamp(min=1), *shares), -1).double()
 
 
-def _count(points: Tensor, mask: Tensor | None) -> Tensor:
-    return torch.full_like(points[:, 0, 0], points.shape[1], dtype=torch.int64) if mask is None else mask.sum(-1)
+def _distinct(points: Tensor, mask: Tensor | None) -> Tensor | None:
+    """The mask without all but the first of coincident points; as it is where there are none."""
+    clouds = points.detach().cpu().numpy()
+    # Sorting one axis costs little, and tells that there are none of nearly all clouds that have none.
+    if not any((np.diff(np.sort(cloud[:, 0])) == 0).any() for cloud in clouds):
+        return mask
+    real = np.ones(clouds.shape[:2], bool) if mask is None else mask.cpu().numpy()
+    kept = np.zeros_like(real)
+    for rows, cloud, own in zip(kept, clouds, real, strict=True):
+        numbers = np.flatnonzero(own)
+        rows[numbers[np.unique(cloud[numbers], axis=0, return_index=True)[1]]] = True
+    return mask if (kept == real).all() else torch.from_numpy(kept).to(points.device)
 
 
 def _gaps(points: Tensor, mask: Tensor | None) -> Tensor:

@@ -50,6 +50,8 @@ def _check_feature_pair(given: CloudPair) -> None:
     if P is not None and Q is not None and P.shape[-1] != Q.shape[-1]:
         raise ValueError(f"P_features has {P.shape[-1]} channels and Q_features {Q.shape[-1]}; they must agree")
     for name, features, mask in (("P_features", P, given.P_mask), ("Q_features", Q, given.Q_mask)):
+        if features is not None and not features.shape[-1]:
+            raise ValueError(f"{name} has shape {tuple(features.shape)}, no channels: leave it out")
         if features is not None:
             checks.check_finite(name, features, mask)
 
@@ -65,7 +67,13 @@ def checked_start(start: RigidMotion | None, pair: CloudPair, batch: tuple[int, 
         return None
     if not isinstance(start, RigidMotion):
         raise ValueError(f"start is a {type(start).__name__}; expected a RigidMotion: try RigidMotion.from_matrix(...)")
+    if not all(isinstance(part, Tensor) for part in start):
+        found = ", ".join(type(part).__name__ for part in start)
+        raise ValueError(f"start holds ({found}); the layer takes tensors: torch.as_tensor each, or use register")
     d = pair.P.shape[-1]
+    if start.rotation.shape[:-2] != start.translation.shape[:-1]:
+        shapes = f"{tuple(start.rotation.shape)} and translation {tuple(start.translation.shape)}"
+        raise ValueError(f"start has rotation {shapes}; one of each per pose is wanted: expand one")
     if start.translation.shape[-1] != d or start.rotation.shape[-2:] != (d, d):
         raise ValueError(f"start moves {start.translation.shape[-1]}D points and the clouds are {d}D")
     if tuple(start.translation.shape[:-1]) not in ((), batch):

@@ -40,10 +40,11 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
            [0., 1., 0.],
            [0., 0., 1.]])
     """
+    tensor = next((x for x in (P, Q) if isinstance(x, torch.Tensor)), None)
     for side, cloud in (("P", P), ("Q", Q)):
         if isinstance(cloud, Cloud) and cloud.normals is not None:
-            given.setdefault(f"{side}_normals", cloud.normals)
-    P, Q = (x.points if isinstance(x, Cloud) else x for x in (P, Q))
+            given.setdefault(f"{side}_normals", _like(tensor, cloud.normals))
+    P, Q = (_like(tensor, x.points) if isinstance(x, Cloud) else x for x in (P, Q))
     unknown = sorted(given.keys() - GIVEN)
     if unknown:
         known = ", ".join(sorted(GIVEN))
@@ -59,6 +60,11 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
         return chosen(P, Q, **given)
     answer: Registration = arrays(chosen(**_of_one_type({"P": P, "Q": Q, **given})))
     return answer
+
+
+def _like(tensor: torch.Tensor | None, array: np.ndarray) -> Array:
+    """What a file gave as a tensor of the kind of the other cloud, where that is one."""
+    return array if tensor is None else from_array(array).to(tensor)
 
 
 def _matrix(start: Array) -> torch.Tensor:
@@ -77,11 +83,15 @@ def _of_one_type(given: Mapping[str, Array | RigidMotion]) -> dict[str, torch.Te
         else:
             found[name] = _numbers(name, x)
     wanted = np.result_type(np.float32, *(x.dtype for x in found.values()))
+    wanted = min(wanted, np.dtype(np.float64))  # there are no wider tensors
     return others | {name: from_array(x if x.dtype == bool else x.astype(wanted)) for name, x in found.items()}
 
 
 def _numbers(name: str, given: Array) -> np.ndarray:
-    array = np.asarray(given)
+    try:
+        array = np.asarray(given)
+    except ValueError as error:
+        raise ValueError(f"{name} is no array of numbers, its rows are not of one length: {error}") from None
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} is an array of {array.dtype}; it must hold numbers: try {name}.astype(float)")
     return array

@@ -33,14 +33,15 @@ class RigidMotion(NamedTuple):
 
     @numpy_too
     def __call__(self, points: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
-        """Carry points ``(*batch, n, d)`` by the motion; the answer has the points' dtype."""
+        """Carry points ``(*batch, n, d)`` by the motion; the answer has the points' dtype, of integers the motion's."""
         moved = points.to(self.translation.dtype) @ self.rotation.mT + self.translation[..., None, :]
-        return moved.to(points.dtype)
+        return moved.to(points.dtype) if points.is_floating_point() else moved
 
     @numpy_too
     def rotate(self, vectors: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
-        """Turn vectors (normals, directions) ``(*batch, n, d)`` without translating them."""
-        return (vectors.to(self.rotation.dtype) @ self.rotation.mT).to(vectors.dtype)
+        """Turn vectors (normals, directions) ``(*batch, n, d)`` without translating them; types as for points."""
+        turned = vectors.to(self.rotation.dtype) @ self.rotation.mT
+        return turned.to(vectors.dtype) if vectors.is_floating_point() else turned
 
     @property
     def dimension(self) -> int:

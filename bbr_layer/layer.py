@@ -16,7 +16,7 @@ from bbr_layer.registration import Registration, judged
 from bbr_layer.stage import Inner, Stage
 from bbr_layer.starts import best_start
 from bbr_layer.temperature import Temperature
-from bbr_layer.transforms import is_transformed, registered
+from bbr_layer.transforms import Settled, is_transformed, places_of, registered, settings_of
 
 # Measured (benchmarks/starts.md, planar.md): none of 180 registrations turned by 30 to 90 degrees fails.
 ROBUST_STARTS = 7
@@ -145,9 +145,8 @@ class BBRLayer(nn.Module):
         return self._called(given, start)
 
     def _called(self, given: CloudPair, start: RigidMotion | None) -> Registration:
-        if is_transformed(given, start):
-            return registered(self._entered, given, start)
-        return self._entered(given, start)
+        how = Settled(self._entered, places_of(self))
+        return registered(how, given, start) if is_transformed(given, start, how) else self._entered(given, start)
 
     def _entered(self, given: CloudPair, start: RigidMotion | None) -> Registration:
         """Check what came, and register it under the caller's mode of autograd, whichever that is."""
@@ -167,7 +166,8 @@ class BBRLayer(nn.Module):
         motion = begun_at(start, pair, frame, self.scaled)
         stages = [stage for stage in self.sequence if stage.wanted(pair)]
         if not stages:
-            raise ValueError(f"P is in {pair.P.shape[-1]}D, and no stage of the layer is for such: try dimension=None")
+            shown = f"{pair.P.shape[-1]}D clouds of up to {max(pair.P.shape[1], pair.Q.shape[1])} points"
+            raise ValueError(f"no stage of the layer is for {shown}: look at its dimension, above and upto")
         starts = self.starts or (ROBUST_STARTS if start is None and stages[0].dimension == 2 else 1)
         if starts > 1:
             motion, stages, tried, whole = best_start(starts, stages, (pair, frame), motion)
@@ -184,9 +184,8 @@ class BBRLayer(nn.Module):
         return judged(pair, frame, ended, inner_steps(stages))
 
     def _wants_gradient(self, pair: CloudPair, start: RigidMotion | None) -> bool:
-        settings = [x for m in self.modules() for x in vars(m).values() if isinstance(x, Tensor)]
-        fields = [x for x in (*pair, *(start or ())) if x is not None]
-        return any(x.requires_grad for x in (*fields, *settings, *self.parameters()))
+        given = *pair, *(start or ()), *settings_of(places_of(self))
+        return any(x is not None and x.requires_grad for x in given)
 
     def __repr__(self) -> str:
         settings = [*map(repr, self.stages), f"backward={self.backward_mode!r}"]

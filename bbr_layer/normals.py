@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bbr_layer.arrays import numpy_too
 from bbr_layer.neighbourhoods import nearest_neighbours
+from bbr_layer.once import only_once
 from bbr_layer.threads import side_by_side
 
 COMPILED = importlib.util.find_spec("numba") is not None
@@ -30,8 +31,8 @@ def estimate_normals(
     """Unit normals ``(*batch, n, d)``: the direction in which each neighbourhood is thinnest.
 
     Normals point away from the cloud's centroid, so that they turn with the cloud and two clouds of one object agree.
-    Differentiable in the points to first order by perturbation of the eigenvector; where two directions are equally
-    thin (lines in 3D, single points) the normal is arbitrary and its gradient 0.
+    Differentiable in the points, once, by perturbation of the eigenvector; where two directions are equally thin (lines
+    in 3D, single points) the normal is arbitrary and its gradient 0. Of whole numbers the normals are float64.
 
     Parameters
     ----------
@@ -51,13 +52,17 @@ def estimate_normals(
     batch, (n, d) = points.shape[:-2], points.shape[-2:]
     if neighbours < d:
         raise ValueError(f"neighbours is {neighbours}; a normal in {d}D needs at least {d}: try {NORMAL_NEIGHBOURS}")
+    if not points.is_floating_point():
+        points = points.double()
+    if not n:
+        return points
     flat = points if len(batch) == 1 else points.reshape(-1, n, d)
     real = None if mask is None else mask.reshape(-1, n)
     index = nearest_neighbours(flat, neighbours, real)
     variances, axes = _axes(flat, index)
     normals = axes[..., 0]
     if torch.is_grad_enabled() and flat.requires_grad:
-        normals = normals + _first_order(_covariance(flat, index), variances, axes)
+        normals = normals + only_once(_first_order(_covariance(flat, index), variances, axes), flat)
     outward = _outward(normals, flat.double(), real)
     return (normals * outward).to(points.dtype).reshape(*batch, n, d)
 

@@ -80,6 +80,14 @@ class CloudPair(NamedTuple):
             raise ValueError(f"{missing} is missing; matching by features needs both: or match='points'")
         return self.P_features, self.Q_features
 
+    def real_counts(self) -> tuple[Tensor, Tensor]:
+        """How many points of P and of Q are real, ``(batch,)`` each."""
+        counts = []
+        for points, mask in ((self.P, self.P_mask), (self.Q, self.Q_mask)):
+            every = torch.full(points.shape[:1], points.shape[1], device=points.device)
+            counts.append(every if mask is None else mask.sum(-1))
+        return counts[0], counts[1]
+
     def pair_mask(self) -> Tensor | None:
         """True where both points are real, broadcast to ``(batch, n, m)``; None when every point is."""
         if self.P_mask is None and self.Q_mask is None:

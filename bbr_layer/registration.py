@@ -60,7 +60,8 @@ class Registration(NamedTuple):
     radius: ``(*batch,)`` root-mean-square radius of the source, in the data's unit; 1 where that is 0.
     confidence: ``(*batch,)`` probability, 0 to 1, that the answer is right: rotation at most 5 degrees off, points at
         most 5 percent of the radius on average (docs/trust.md). 0 where there are no buddies, where a direction is free
-        (``DEGENERATE``) and where the pose is not finite. Like all from ``iterations`` on it has no gradient.
+        (``DEGENERATE``) and where the pose is not finite; at most k / 100 of k points under 100. Like all from
+        ``iterations`` on it has no gradient.
     """
 
     target_from_source: RigidMotion
@@ -151,5 +152,6 @@ def judged(pair: CloudPair, frame: Frame, ended: StageResult, steps: int) -> Reg
 
 
 def _same(seen: CloudPair, pair: CloudPair) -> bool:
-    """Whether a pair was neither thinned nor given normals."""
-    return all(getattr(seen, name) is getattr(pair, name) for name in ("P", "Q", "P_normals", "Q_normals"))
+    """Whether a pair was neither thinned nor given normals, and has no points in one place."""
+    names = "P", "Q", "P_normals", "Q_normals", "P_mask", "Q_mask"
+    return all(getattr(seen, name) is getattr(pair, name) for name in names)

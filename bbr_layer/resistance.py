@@ -36,13 +36,13 @@ def resistance(pair: CloudPair, motion: RigidMotion, found: Matches, scale: Tens
     scale: ``(batch,)`` of the frame.
     """
     arms = motion.rotate(pair.Q.double()) * scale[:, None, None]
-    neighbours, smallest = NORMAL_NEIGHBOURS, min(pair.P.shape[1], pair.Q.shape[1])
+    neighbours, largest = NORMAL_NEIGHBOURS, LARGEST_PATCH * torch.minimum(*pair.real_counts())
     held, agreed = _agreed_hold(arms, found, neighbours)
-    while not agreed.all() and 2 * neighbours <= LARGEST_PATCH * smallest:
+    while (open_items := ~agreed & (2 * neighbours <= largest)).any():
         neighbours *= 2
         found = _with_normals(pair, motion, found, neighbours)
         coarser, settled = _agreed_hold(arms, found, neighbours)
-        held, agreed = torch.where(agreed[:, None, None], held, coarser), agreed | settled
+        held, agreed = torch.where(open_items[:, None, None], coarser, held), agreed | (open_items & settled)
     if pair.Q.shape[-1] == 3:
         axis, line = _line(arms, found.mutual, agreed)
         held = torch.where(line[:, None, None], _line_hold(arms, axis, found.mutual), held)

@@ -47,8 +47,8 @@ class Stage(nn.Module):
     temperature: ``Annealed(...)`` or ``Learned(...)``. Default ``Annealed()``, from 2 point spacings to 1.
     chart: ``RotationVector()`` (default; scale-free) or ``EulerAngles()`` (the paper's, in data units).
     points: most points of each cloud that the stage sees, spread evenly in space. Default None, all of them.
-    above: the stage is left out where neither cloud has more points than this. Default 0, never.
-    upto: the stage is left out where either cloud has more points than this. Default None, never.
+    above: the stage is left out where no cloud of a batch has more real points than this. Default 0, never.
+    upto: the stage is left out where any cloud of a batch has more real points than this. Default None, never.
     dimension: 2 or 3, the stage is left out for other clouds. Default None, never.
 
     Raises
@@ -112,9 +112,11 @@ class Stage(nn.Module):
         return StageResult(reached.frame.leave(motion), loss, final * frame.scale, end.gradient_norm, settled)
 
     def wanted(self, pair: CloudPair) -> bool:
-        """Whether the clouds are of the dimension, and the larger one of the size, that the stage is for."""
-        _, n, d = pair.P.shape
-        larger = max(n, pair.Q.shape[1])
+        """Whether the clouds are of the dimension, and the larger one of the size, that the stage is for.
+
+        Of a batch the largest counts; padding does not.
+        """
+        d, larger = pair.P.shape[-1], int(torch.maximum(*pair.real_counts()).max())
         return self.dimension in (None, d) and self.above < larger <= (larger if self.upto is None else self.upto)
 
     def attach(self, pair: CloudPair, frame: Frame, ended: StageResult, damping: float) -> tuple[StageResult, str]:

@@ -12,7 +12,7 @@ PROJECT = Path(__file__).resolve().parent.parent
 # "__init__" is the package's public face. A new file needs its name in a row.
 ORDER = {
     "bbr_layer": """
-        checks arrays threads
+        checks arrays threads once
         rotations
         geometry
         embedding pair trees tiles
@@ -49,7 +49,7 @@ ORDER = {
         confidence resistance
         registration
         inner
-        inner.schedules inner.charts inner.once
+        inner.schedules inner.charts
         inner.adam inner.pose_gradient inner.gauss_newton
         inner.squares_step
         inner.unroll

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import reference
 import torch
@@ -91,3 +92,10 @@ def test_the_motion_between_two_poses_leads_through_their_world(d):
         torch.testing.assert_close(poses.item(i)(found.item(row)(points)), in_world)
         torch.testing.assert_close(poses.between(i, j).matrix, found.item(row).matrix)
     torch.testing.assert_close(found.item(2).matrix, torch.eye(d + 1, dtype=torch.float64))
+
+
+def test_whole_numbers_are_not_cut_off(as_a_user):
+    motion = RigidMotion(np.eye(3), np.full(3, 0.5))
+    np.testing.assert_array_equal(motion(np.array([[1, 2, 3]])), [[1.5, 2.5, 3.5]])
+    quarter = RigidMotion.from_rotvec(torch.tensor([0.0, 0.0, torch.pi / 4]), torch.zeros(3))
+    torch.testing.assert_close(quarter.rotate(torch.tensor([[1, 0, 0]])), torch.tensor([[0.5**0.5, 0.5**0.5, 0.0]]))

@@ -202,6 +202,10 @@ WRONG = {
     "P has dtype torch.int64": {"P": P3.long(), "Q": Q3.long()},
     "P_normals holds 8 zero vectors: leave it out": {"P_normals": torch.zeros(8, 3)},
     "P_normals has shape (7, 3)": {"P_normals": P3[:7]},
+    "P_normals has lengths from 0.0173 to 0.0173; normals have length 1: try": {"P_normals": torch.full((8, 3), 0.01)},
+    "P_normals has dtype torch.bool and P torch.float32": {"P_normals": torch.ones(8, 3, dtype=torch.bool)},
+    "P_weights has dtype torch.bool and P torch.float32": {"P_weights": torch.ones(8, dtype=torch.bool)},
+    "P_features has shape (8, 0), no channels": {"P_features": torch.ones(8, 0), "Q_features": torch.ones(9, 0)},
     "Q_weights holds negative weights, as low as -1": {"Q_weights": -torch.ones(9)},
     "P_mask has dtype torch.float32": {"P_mask": torch.ones(8)},
     "Q_features is missing": {"P_features": torch.ones(8, 2)},
@@ -211,6 +215,8 @@ WRONG = {
     "start.rotation is no rotation": {"start": RigidMotion(-EYE, torch.zeros(3))},
     "start is a Tensor; expected a RigidMotion: try RigidMotion.from_matrix": {"start": torch.eye(4)},
     "start is a ndarray; expected a RigidMotion": {"start": np.eye(4)},
+    "start holds (ndarray, ndarray); the layer takes tensors": {"start": RigidMotion(np.eye(3), np.zeros(3))},
+    "start has rotation (2, 3, 3) and translation (3,)": {"start": RigidMotion(EYE.expand(2, 3, 3), torch.zeros(3))},
     "start moves 2D points and the clouds are 3D": {"start": RigidMotion.identity(2)},
 }
 

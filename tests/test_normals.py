@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from bbr_layer import estimate_normals, normals
+from bbr_layer import estimate_normals, normals, point_spacing
 from bbr_layer.neighbourhoods import nearest_neighbours
 
 CLOUDS = {
@@ -46,3 +46,26 @@ def test_an_arbitrary_normal_has_no_gradient():
     assert np.abs((found @ torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)).detach().numpy()).max() < 1e-6
     (gradient,) = torch.autograd.grad((found * torch.randn_like(found)).sum(), line)
     assert torch.isfinite(gradient).all()
+
+
+def test_a_second_derivative_is_refused_in_words():
+    P = torch.randn(20, 3, dtype=torch.float64, requires_grad=True)
+    (first,) = torch.autograd.grad(estimate_normals(P).pow(3).sum(), P, create_graph=True)
+    with pytest.raises(RuntimeError, match=r"first derivatives only.*its normals given"):
+        first.sum().backward()
+
+
+def test_no_points_have_no_normals_and_whole_numbers_have_some(as_a_user):
+    assert estimate_normals(torch.zeros(0, 3)).shape == (0, 3)
+    grid = torch.cartesian_prod(torch.arange(4), torch.arange(4), torch.arange(1))
+    torch.testing.assert_close(estimate_normals(grid).abs(), torch.tensor([0.0, 0.0, 1.0]).double().expand(16, 3))
+
+
+def test_what_is_written_past_torch_is_seen():
+    first, second = torch.randn(2, 1, 30, 3, dtype=torch.float64)
+    wanted = estimate_normals(second), point_spacing(second)
+    for write in (lambda x: x.data.copy_(second), lambda x: x.numpy().__setitem__(..., second.numpy())):
+        points = first.clone()
+        estimate_normals(points), point_spacing(points)
+        write(points)
+        assert torch.equal(estimate_normals(points), wanted[0]) and torch.equal(point_spacing(points), wanted[1])

@@ -13,8 +13,10 @@ from bbr_layer import (
     angular_error,
     estimate_normals,
     point_spacing,
+    read_cloud,
     register,
     translation_error,
+    write_cloud,
 )
 
 
@@ -130,3 +132,18 @@ def test_register_says_what_it_has_no_argument_for(as_a_user):
         register(P, P, start=np.zeros(3))
     with pytest.raises(ValueError, match="^start moves 2D points and the clouds are 3D"):
         register(P, P, start=np.eye(3))
+
+
+def test_a_tensor_and_a_file_go_together(tmp_path):
+    points = np.random.default_rng(0).random((60, 3))
+    write_cloud(tmp_path / "cloud.ply", points)
+    cloud = read_cloud(tmp_path / "cloud.ply")
+    for pair in ((torch.from_numpy(points), cloud), (cloud, torch.from_numpy(points))):
+        assert register(*pair).target_from_source.matrix.dtype == torch.float64
+
+
+def test_wide_numbers_are_made_narrower_and_ragged_ones_refused(as_a_user):
+    points = np.random.default_rng(0).random((40, 2)).astype(np.longdouble)
+    assert register(points, points).target_from_source.rotation.dtype == np.float64
+    with pytest.raises(ValueError, match="P is no array of numbers, its rows are not of one length"):
+        register([[0.0, 1.0], [2.0]], points)

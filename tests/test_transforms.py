@@ -3,9 +3,11 @@
 import pytest
 import torch
 from problems import noisy_pair
-from torch.func import grad, hessian, jacrev, vmap
+from torch import nn
+from torch.func import functional_call, grad, hessian, jacrev, vmap
+from torch.utils.checkpoint import checkpoint
 
-from bbr_layer import Adam, Annealed, BBRLayer, RigidMotion
+from bbr_layer import Adam, Annealed, BBRLayer, Learned, RigidMotion
 
 
 @pytest.fixture(params=["softBD", "F"])
@@ -100,3 +102,51 @@ def test_autocast_changes_nothing(layer):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         found = torch.autograd.grad(_number(layer, P, given["Q"]), P)
     assert torch.equal(found[0], torch.autograd.grad(_number(layer, P, given["Q"]), P)[0])
+
+
+def _learning():
+    layer = BBRLayer("softBD", inner=Adam(5, nn.Parameter(torch.tensor(0.05, dtype=torch.float64))), temperature=Learned(1.0))
+    return layer, dict(layer.named_parameters())
+
+
+def _of_settings(layer):
+    return lambda settings, P, Q: functional_call(layer, settings, (P, Q)).target_from_source.matrix.square().sum()
+
+
+def test_settings_that_are_learned_are_differentiated_too():
+    given, (layer, settings) = noisy_pair(3), _learning()
+    P, Q, number = given["P"], given["Q"], _of_settings(layer)
+    wanted = torch.autograd.grad(number(settings, P, Q), list(settings.values()))
+    before = {name: x.clone() for name, x in settings.items()}
+    _close(grad(number)(settings, P, Q).values(), wanted)
+    assert all(torch.equal(settings[name], x) for name, x in before.items())
+    assert all(isinstance(x, nn.Parameter) for x in layer.parameters())
+
+
+def test_settings_per_sample_and_over_a_map():
+    given, (layer, settings) = noisy_pair(3, batch=3), _learning()
+    P, Q, number = given["P"], given["Q"], _of_settings(layer)
+    by_item = [torch.autograd.grad(number(settings, p, q), list(settings.values())) for p, q in zip(P, Q, strict=True)]
+    wanted = [torch.stack(x) for x in zip(*by_item, strict=True)]
+    _close(vmap(grad(number), in_dims=(None, 0, 0))(settings, P, Q).values(), wanted)
+    vmap(lambda p, q: number(settings, p, q))(P, Q).sum().backward()
+    _close([x.grad for x in settings.values()], [x.sum(0) for x in wanted])
+
+
+def test_a_layer_per_setting():
+    given, (layer, settings) = noisy_pair(3), _learning()
+    P, Q, number = given["P"][0], given["Q"][0], _of_settings(layer)
+    several = {name: torch.stack((x, 0.9 * x)).detach() for name, x in settings.items()}
+    found = vmap(number, in_dims=(0, None, None))(several, P, Q)
+    _close(found, [number({name: x[k] for name, x in several.items()}, P, Q) for k in range(2)])
+
+
+@pytest.mark.parametrize("name", [None, "fast", "softBD", "F"])
+def test_within_a_checkpoint(name):
+    given = {field: x for field, x in noisy_pair(3, n=40, m=40).items() if field in "PQ"}
+    layer = BBRLayer.fast() if name == "fast" else BBRLayer(*[name] if name else [])
+    gradients = []
+    for call in (_number, lambda *given: checkpoint(_number, *given, use_reentrant=False)):
+        P, Q = given["P"].clone().requires_grad_(), given["Q"].clone().requires_grad_()
+        gradients.append(torch.autograd.grad(call(layer, P, Q), (P, Q)))
+    _close(*gradients)

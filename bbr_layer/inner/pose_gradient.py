@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.inner.once import once
 from bbr_layer.kernels.scene import Direction, Kernel, Scene
+from bbr_layer.once import once
 from bbr_layer.pair import CloudPair
 
 # The fields of a pair that a loss may depend on, in order; its masks and its spacing are held.
@@ -66,14 +66,17 @@ class _Slope(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Any, ...]:
+        saved = ctx.saved_tensors  # read once: a checkpoint gives them once
         with torch.no_grad():
-            found = _Slope.pulled_back(ctx, cotangents)
-        return None, *once(found, (*ctx.saved_tensors, *cotangents)), None, None, None
+            found = _Slope.pulled_back(ctx.kernel, saved, cotangents)
+        return None, *once(found, (*saved, *cotangents)), None, None, None
 
     @staticmethod
-    def pulled_back(ctx: Any, cotangents: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
+    def pulled_back(
+        kernel: Kernel, saved: tuple[Any, ...], cotangents: tuple[Tensor | None, ...]
+    ) -> tuple[Tensor | None, ...]:
         """Cotangents of rounding, temperature, motion and the differentiable fields of the pair."""
-        rounding, temperature, *rest = ctx.saved_tensors
+        rounding, temperature, *rest = saved
         motion, pair = RigidMotion(*rest[:2]), CloudPair._make(rest[2:])
         scene = Scene(pair.moved_by(motion), temperature, rounding)
         by_loss, rotation, translation, by_temperature = cotangents
@@ -84,9 +87,9 @@ class _Slope(torch.autograd.Function):
             along = RigidMotion(turn, shift)
             heat = torch.zeros_like(temperature) if by_temperature is None else by_temperature
             direction = Direction(along(pair.Q), _turned(along, pair.Q_normals), heat)
-            gradient, total = ctx.kernel.directional(scene, motion, direction)
+            gradient, total = kernel.directional(scene, motion, direction)
         else:
-            _, gradient = ctx.kernel.gradient(scene, motion)
+            _, gradient = kernel.gradient(scene, motion)
             total = _scaled(gradient, torch.zeros_like(temperature))
         if by_loss is not None:
             total = _sum(total, _scaled(gradient, by_loss))

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.gauss_newton import solved
-from bbr_layer.inner.once import once
 from bbr_layer.kernels.squares import Squares
+from bbr_layer.once import once
 from bbr_layer.pair import CloudPair
 
 

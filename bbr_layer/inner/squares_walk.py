@@ -13,11 +13,11 @@ from bbr_layer.embedding import AXES, matrices_in_space
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.charts import RotationVector, State
 from bbr_layer.inner.gauss_newton import LONGEST_STEP, shortened, solved
-from bbr_layer.inner.once import once
 from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.kernels.cpu_matched import MatchedClouds, equations_of, matched_clouds
 from bbr_layer.kernels.cpu_turns import exponential
 from bbr_layer.kernels.squares import MatchedSquares
+from bbr_layer.once import once
 from bbr_layer.pair import CloudPair
 from bbr_layer.threads import side_by_side
 from bbr_layer.trees import in_space
@@ -91,7 +91,8 @@ class _Walk(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Any, ...]:
-        temperatures, _, translation, *fields = ctx.saved_tensors
+        saved = ctx.saved_tensors  # read once: a checkpoint gives them once
+        temperatures, _, translation, *fields = saved
         pair, d = CloudPair._make(fields), translation.shape[-1]
         by_pose, by_heats = cotangents[:2], torch.zeros_like(temperatures)
         by_pair: list[Tensor | None] = [None] * len(fields)
@@ -100,7 +101,7 @@ class _Walk(torch.autograd.Function):
             by_pose, by_heats[step], parts = _pulled_back(ctx.steps, pair, (at, heat), by_pose)
             by_pair = [a if b is None else b if a is None else a + b for a, b in zip(by_pair, parts, strict=True)]
         found = [by_heats, *by_pose, *by_pair]
-        return None, *once(found, (*ctx.saved_tensors, *cotangents))
+        return None, *once(found, (*saved, *cotangents))
 
 
 def _descend(

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from bbr_layer.embedding import AXES, matrices_in_space
 from bbr_layer.inner.adam import Adam
-from bbr_layer.inner.once import once
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace
 from bbr_layer.kernels.cpu_course import Adjoint
+from bbr_layer.once import once
 from bbr_layer.pair import CloudPair
 from bbr_layer.threads import side_by_side
 from bbr_layer.trees import in_space
@@ -114,14 +114,15 @@ class _Walk(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Any, ...]:
+        saved = ctx.saved_tensors  # read once: a checkpoint gives them once
         with torch.no_grad():
-            found = _Walk.pulled_back(ctx, cotangents)
-        return None, *once(found, (*ctx.saved_tensors, *cotangents))
+            found = _Walk.pulled_back(ctx, saved, cotangents)
+        return None, *once(found, (*saved, *cotangents))
 
     @staticmethod
-    def pulled_back(ctx: Any, cotangents: tuple[Tensor, ...]) -> list[Tensor | None]:
+    def pulled_back(ctx: Any, saved: tuple[Any, ...], cotangents: tuple[Tensor, ...]) -> list[Tensor | None]:
         """Cotangents of everything that is saved, in order."""
-        rounding, temperatures, rates, _, translation, _, _, *fields = ctx.saved_tensors
+        rounding, temperatures, rates, _, translation, _, _, *fields = saved
         pair, d, steps = CloudPair._make(fields), translation.shape[-1], ctx.steps
         scene, course = steps.look(pair, rounding), steps.course(temperatures, rates, d)
         (count, batch), axes = temperatures.shape, AXES[d]

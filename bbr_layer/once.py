@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 MESSAGE = (
-    "Replay(), Truncated() and Implicit() give first derivatives only, and a second one was asked for "
-    "(create_graph=True, torch.func.jvp or hessian): use BBRLayer(..., backward=Autograd())"
+    "there are first derivatives only here, and a second one was asked for (create_graph=True, jvp or hessian): a "
+    "layer gives it by BBRLayer(..., backward=Autograd()), its normals given, outside torch.func "
+    "(torch.autograd.functional.hessian)"
 )
 
 
@@ -31,3 +32,20 @@ class _Refused(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> Any:
         raise RuntimeError(MESSAGE)
+
+
+def only_once(value: Tensor, anchor: Tensor) -> Tensor:
+    """A value whose first derivative by ``anchor``, a tensor that it comes from, is right, and no other one."""
+    answer: Tensor = _First.apply(value, anchor)
+    return answer
+
+
+class _First(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, anchor: Tensor) -> Tensor:
+        ctx.save_for_backward(anchor)
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, cotangent: Tensor) -> Any:
+        return *once([cotangent], [*ctx.saved_tensors, cotangent]), None

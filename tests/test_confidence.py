@@ -1,0 +1,71 @@
+"""What must not change how far an answer is trusted: points given twice, padding; and that a handful says little."""
+
+import pytest
+import torch
+from problems import bumpy
+
+from bbr_layer import Adam, BBRLayer, GaussNewton, RigidMotion, Stage, Status
+from bbr_layer.losses import BuddyFilter, SoftBD
+
+STILL = RigidMotion.identity(3)
+
+
+def _samples(n):
+    return bumpy(n, 3), bumpy(n, 3)
+
+
+def _again(points, share):
+    """The points, and so many of them once more."""
+    return torch.cat((points, points[: int(share * len(points))]))
+
+
+@pytest.mark.parametrize("share", [1 / 3, 1.0])
+def test_points_given_twice_are_no_evidence_against_an_answer(share):
+    P, Q = _samples(300)
+    layer = BBRLayer("F", inner=Adam(1, 1e-9))
+    once = layer(P, Q, start=STILL)
+    for twice in ((_again(P, share), _again(Q, share)), (P, _again(Q, share))):
+        found = layer(*twice, start=STILL)
+        assert found.confidence == pytest.approx(float(once.confidence), abs=0.02)
+    assert once.confidence > 0.9
+
+
+def test_padding_is_no_duplicate():
+    P, Q = _samples(120)
+    mask = torch.arange(150) < 120
+    padded = [torch.cat((x, x.new_zeros(30, 3))) for x in (P, Q)]
+    layer = BBRLayer("F", inner=Adam(1, 1e-9))
+    found = layer(*padded, P_mask=mask, Q_mask=mask, start=STILL)
+    torch.testing.assert_close(found.confidence, layer(P, Q, start=STILL).confidence)
+
+
+@pytest.mark.parametrize("n", [5, 20, 60])
+def test_few_points_are_believed_little_whatever_they_say(n):
+    P, Q = torch.rand(n, 3), torch.rand(300, 3)
+    assert 0 <= BBRLayer.fast()(P, Q).confidence <= n / 100
+
+
+def test_how_much_is_held_does_not_hang_on_padding():
+    P, Q = bumpy(120, 3), bumpy(60, 3)
+    layer = BBRLayer("N", inner=Adam(2, 1e-9))
+    alone = layer(P, Q, start=STILL)
+    sizes = {"P": (P, 207), "Q": (Q, 223)}
+    padded = {name: torch.cat((x, x.new_zeros(n - len(x), 3))) for name, (x, n) in sizes.items()}
+    masks = {f"{name}_mask": torch.arange(n) < len(x) for name, (x, n) in sizes.items()}
+    found = layer(**padded, **masks, start=STILL)
+    torch.testing.assert_close(found.resistance, alone.resistance)
+    assert found.status == alone.status != Status.DEGENERATE
+
+
+def test_padding_does_not_decide_which_stages_run():
+    P, Q = bumpy(50, 3), bumpy(60, 3)
+    layer = BBRLayer(Stage(SoftBD(), Adam(2)), Stage(BuddyFilter(), GaussNewton(3), above=64))
+    mask = torch.arange(90) < 60
+    padded = torch.cat((Q, Q.new_zeros(30, 3)))
+    assert layer(P, padded, Q_mask=mask).iterations == layer(P, Q).iterations == 2
+    assert layer(P, padded).iterations == 5
+
+
+def test_a_size_that_no_stage_is_for_is_named(as_a_user):
+    with pytest.raises(ValueError, match="no stage of the layer is for 3D clouds of up to 60 points: look at its dim"):
+        BBRLayer(Stage(SoftBD(), upto=50))(bumpy(40, 3), bumpy(60, 3))
