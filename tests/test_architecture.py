@@ -90,7 +90,7 @@ ORDER = {
         curves pictures browser_map
         config scans
         prepared pose_graph consensus
-        surfaces edge_files report run_folder
+        surfaces edge_files report run_folder checkpoints
         shape_features refinement
         free_space_evidence planes
         scene moving_points

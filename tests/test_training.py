@@ -9,12 +9,13 @@ from small_worlds import displaced, small_config, small_world, true_edges, true_
 
 from bbr_layer import RigidMotion
 from train.alignment import Alignment
+from train.checkpoints import LAST
 from train.data_module import prepare_scan
 from train.keep_best import SCORE
 from train.run_folder import open_run
 from train.settling import MOVED, trajectory_change
 from train.surface_map import MapScore, SurfaceMap
-from train.training import LAST, train_map
+from train.training import train_map
 
 # Settings under which few epochs bring displaced poses of the small world closer.
 HELPFUL = {"term": "residual", "localisation_rate": 0.03}
@@ -26,7 +27,7 @@ class Killed(Exception):
 
 def killed_after(epoch):
     def progress(stage, done, total):
-        if done == epoch:
+        if (stage, done) == ("training", epoch):
             raise Killed
 
     return progress
@@ -45,7 +46,10 @@ def test_a_killed_training_goes_on_to_the_same_bits(tmp_path, epoch, adjust):
     whole = train_map(*problem, folder=tmp_path / "whole")
     with pytest.raises(Killed):
         train_map(*problem, folder=tmp_path / "killed", progress=killed_after(epoch))
-    resumed = train_map(*problem, folder=tmp_path / "killed")
+    assert (tmp_path / "killed" / "checkpoints" / LAST).is_file() == (epoch > 1), "an epoch is kept once it is over"
+    told = []
+    resumed = train_map(*problem, folder=tmp_path / "killed", progress=lambda *news: told.append(news))
+    assert [done for stage, done, _ in told if stage == "training"] == list(range(epoch, 6))
     assert torch.equal(resumed.world_from_scan.matrix, whole.world_from_scan.matrix)
     assert torch.equal(weights(resumed), weights(whole))
     assert resumed.curves == whole.curves
@@ -159,6 +163,7 @@ def test_fast_dev_run(tmp_path):
     scans = small_world()
     trained = train_map(scans, true_edges(scans), true_poses(scans), small_config(), folder=tmp_path, fast_dev_run=True)
     assert len(trained.curves["total"]) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_logs_for_people_and_programs(tmp_path):

@@ -6,22 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import lightning as L
-from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from bbr_layer import RigidMotion
 from train.alignment import Alignment
+from train.checkpoints import LAST, KeepLast, WholeCheckpoints
 from train.config import MapConfig
 from train.data_module import MappingData
 from train.keep_best import MARGIN, KeepBest, ReportProgress
 from train.mapping_module import MappingModule, build_module
 from train.pose_graph import Edges
+from train.run_folder import CHECKPOINTS, LOGS
 from train.scans import Progress, ScanSet, silent
 from train.settling import MOVED, SettleWhenStill
 from train.surface_map import MapScore, SurfaceMap
 
-# The file in the folder of checkpoints that a killed run goes on from.
-LAST = "last.ckpt"
 LEAF_SPEC = r"`isinstance\(treespec, LeafSpec\)` is deprecated"
 
 
@@ -63,8 +62,9 @@ def train_map(
     config: settings.
     folder: gets ``checkpoints/`` and ``logs/``; a checkpoint found there is gone on from. None: nothing is written.
     progress: told each epoch.
-    fast_dev_run: one step only, as Lightning has it.
+    fast_dev_run: one step only, as Lightning has it; nothing is read or written.
     """
+    folder = None if fast_dev_run else folder
     data = MappingData(scans, edges, start, config=config.training, seed=config.seed)
     module = build_module(data, config.training, seed=config.seed)
     if not config.training.epochs:
@@ -84,6 +84,7 @@ def train_map(
         log_every_n_steps=1,
         fast_dev_run=fast_dev_run,
         enable_checkpointing=folder is not None,
+        plugins=[WholeCheckpoints()],
         # Progress is reported through ``progress``, for the whole of the run in one place.
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -96,7 +97,7 @@ def train_map(
 
 def _fit(trainer: L.Trainer, module: MappingModule, data: MappingData, folder: Path | None) -> None:
     """Train, from the folder's checkpoint on if there is one."""
-    checkpoint = None if folder is None else folder / "checkpoints" / LAST
+    checkpoint = None if folder is None else folder / CHECKPOINTS / LAST
     found = checkpoint is not None and checkpoint.is_file()
     with warnings.catch_warnings():
         # Lightning 2.6 walks trees by a class that torch 2.13 renames; nothing for a user to act on.
@@ -107,14 +108,12 @@ def _fit(trainer: L.Trainer, module: MappingModule, data: MappingData, folder: P
 def _callbacks(best: KeepBest, folder: Path | None, progress: Progress) -> list[L.Callback]:
     callbacks: list[L.Callback] = [best, ReportProgress(progress)]
     if folder is not None:
-        # One file, replaced after every epoch; the best poses lie in it, in KeepBest's part.
-        last = ModelCheckpoint(folder / "checkpoints", save_last=True, save_top_k=0, enable_version_counter=False)
-        callbacks.append(last)
+        callbacks.append(KeepLast(folder / CHECKPOINTS / LAST))
     return callbacks
 
 
 def _loggers(folder: Path | None) -> list[Logger]:
     if folder is None:
         return []
-    logs = str(folder / "logs")
+    logs = str(folder / LOGS)
     return [CSVLogger(logs, name="csv"), TensorBoardLogger(logs, name="tensorboard")]
