@@ -198,10 +198,39 @@ def test_a_folder_with_another_map_is_refused(tmp_path, opened):
         opened(small_world(), small_config(term="chamfer"))
     with pytest.raises(ValueError, match="made from other scans and edges"):
         opened(small_world(3), small_config(), origin="poses")
-    (tmp_path / "checkpoints" / "run.json").unlink()
+    (tmp_path / "checkpoints" / "run.json").write_text("damaged")
     with pytest.raises(ValueError, match="made from unknown settings"):
         opened(small_world(), small_config())
     assert (tmp_path / "edges.npz").exists()
+
+
+@pytest.mark.parametrize("name", ["logs/mine.log", "checkpoints/mine.ckpt", "edges.npz", "poses.npz"])
+@pytest.mark.parametrize("resume", [False, True])
+def test_files_that_no_run_left_are_deleted_only_when_asked(tmp_path, name, resume):
+    mine = tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    (tmp_path / "checkpoints").mkdir(exist_ok=True)
+    with pytest.raises(ValueError, match=rf"holds {name.split('/')[0]} but no .* or --overwrite to delete it"):
+        open_run(tmp_path, small_world(), small_config(), resume=resume)
+    assert mine.read_text() == "mine"
+    open_run(tmp_path, small_world(), small_config(), overwrite=True)
+    assert not mine.exists() or name == "poses.npz"
+    open_run(tmp_path, small_world(), small_config())
+
+
+def test_a_run_killed_while_its_folder_is_cleared_is_still_known_as_one(tmp_path, opened, monkeypatch):
+    opened(small_world(), small_config())
+
+    def killed(path):
+        raise Killed
+
+    monkeypatch.setattr("train.run_folder.atomic_write", killed)
+    with pytest.raises(Killed):
+        open_run(tmp_path, small_world(), small_config())
+    monkeypatch.undo()
+    assert not (tmp_path / "checkpoints" / LAST).exists()
+    open_run(tmp_path, small_world(), small_config(), resume=True)
 
 
 def test_an_unfinished_run_of_other_settings_is_replaced(tmp_path, opened):

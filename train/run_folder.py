@@ -15,6 +15,8 @@ CHECKPOINTS, LOGS = "checkpoints", "logs"
 STATE = Path(CHECKPOINTS, "run.json")
 # Written when the map is there; whoever finds it finds a map.
 MAP = "poses.npz"
+# What a run without ``resume`` takes away.
+REPLACED = (EDGES, CHECKPOINTS, LOGS)
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,12 @@ def open_run(
 
     Raises
     ------
-    ValueError: the folder holds a map from other scans or settings, and neither ``resume`` nor ``overwrite`` is set.
+    ValueError: the folder holds a map from other scans or settings, and neither ``resume`` nor ``overwrite`` is set; or
+        files that no run is known to have left and that this one would delete, and ``overwrite`` is not set.
     OSError: the folder cannot be written.
     """
+    if not overwrite:
+        _refuse_files_of_others(path)
     wanted, earlier = _state(scans, config, origin), _read_state(path)
     same = {key: earlier.get(key) == value for key, value in wanted.items()}
     if (path / MAP).exists() and not all(same.values()) and not (resume or overwrite):
@@ -72,12 +77,32 @@ def open_run(
     if not registered:
         (path / EDGES).unlink(missing_ok=True)
     if not begun:
-        for folder in (CHECKPOINTS, LOGS):
-            shutil.rmtree(path / folder, ignore_errors=True)
-        _make_folder(path / CHECKPOINTS)
+        _forget_training(path)
     with atomic_write(path / STATE) as temporary:
         temporary.write_text(json.dumps(wanted, indent=2), encoding="utf-8")
     return RunFolder(path, registered and (path / EDGES).is_file(), begun)
+
+
+def _refuse_files_of_others(path: Path) -> None:
+    """A folder without the state of a run is not ours to clear; empty folders are nothing to lose."""
+    if (path / STATE).exists():
+        return
+    found = [name for name in (*REPLACED, MAP) if (path / name).is_file() or any((path / name).glob("*"))]
+    if found:
+        raise ValueError(
+            f"{path} holds {', '.join(found)} but no {STATE} that tells what run left that: give another folder, or "
+            "--overwrite to delete it"
+        )
+
+
+def _forget_training(path: Path) -> None:
+    """Remove checkpoints and logs; the state stays until the next replaces it, and tells that the folder is ours."""
+    shutil.rmtree(path / LOGS, ignore_errors=True)
+    for found in (path / CHECKPOINTS).iterdir():
+        if found.is_dir():
+            shutil.rmtree(found)
+        elif found != path / STATE:
+            found.unlink()
 
 
 def _state(scans: ScanSet, config: MapConfig, origin: str) -> dict[str, object]:
