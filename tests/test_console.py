@@ -1,12 +1,14 @@
 """Progress is shown wherever the output goes: bars on a terminal, now and then a line in a log."""
 
 import io
+import signal
 
 import pytest
 from rich.console import Console
 
 from train import console as module
-from train.console import shown_progress
+from train.console import one_sentence, shown_progress
+from train.training import Stopped
 
 
 class Clock:
@@ -51,3 +53,11 @@ def test_a_terminal_gets_bars():
         report("window", 1, 4)
         report("window", 4, 4)
     assert "window" in screen.getvalue() and "4/4" in screen.getvalue() and "━" in screen.getvalue()
+
+
+def test_a_signal_is_told_of_with_the_exit_code_of_a_shell(capsys):
+    with pytest.raises(SystemExit) as ended, one_sentence():
+        raise Stopped(signal.SIGTERM)
+    assert ended.value.code == 143
+    told = capsys.readouterr().err
+    assert told.startswith("SIGTERM stopped the training") and told.count("\n") == 1

@@ -1,6 +1,8 @@
 """The training as a whole: never worse than its start, and the same answer however often it was broken off."""
 
 import dataclasses
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from train.keep_best import SCORE
 from train.run_folder import open_run
 from train.settling import MOVED, trajectory_change
 from train.surface_map import MapScore, SurfaceMap
-from train.training import train_map
+from train.training import Stopped, train_map
 
 # Settings under which few epochs bring displaced poses of the small world closer.
 HELPFUL = {"term": "residual", "localisation_rate": 0.03}
@@ -56,6 +58,27 @@ def test_a_killed_training_goes_on_to_the_same_bits(tmp_path, epoch, adjust):
     assert resumed.kept_epoch == whole.kept_epoch
     assert (whole.kept_epoch > 0) == (not adjust), "after the adjustment no epoch is better here"
     assert [len(curve) for curve in whole.curves.values()] == [6, 5, 5, 5, 5]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("epoch", [2, 3])
+def test_a_training_that_a_signal_stops_says_so_and_goes_on_to_the_same_bits(tmp_path, number, code, epoch):
+    scans = small_world()
+    problem = scans, true_edges(scans), displaced(true_poses(scans), 0.1), small_config(epochs=3, points=20)
+    handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
+
+    def stopping(stage, done, total):
+        if (stage, done) == ("training", epoch):
+            os.kill(os.getpid(), number)
+
+    with pytest.raises(Stopped, match=f"{number.name} stopped the training .* --resume goes on") as stopped:
+        train_map(*problem, folder=tmp_path, progress=stopping)
+    assert stopped.value.code == code
+    assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == handlers
+    assert (tmp_path / "checkpoints" / LAST).is_file()
+    resumed, whole = train_map(*problem, folder=tmp_path), train_map(*problem)
+    assert torch.equal(weights(resumed), weights(whole))
+    assert resumed.curves == whole.curves
 
 
 def test_a_finished_training_is_not_done_again(tmp_path):

@@ -15,6 +15,7 @@ from train.evaluate import evaluate_trajectory
 from train.keep_best import SCORE
 from train.mapping import Mapped
 from train.scans import Progress as Report
+from train.training import Stopped
 
 # The exit code that command lines give to wrong arguments.
 BAD_INPUT = 2
@@ -48,12 +49,18 @@ class PrintedUnit:
 
 @contextmanager
 def one_sentence() -> Iterator[None]:
-    """What is wrong with the input in one sentence on stderr and exit code 2, without a traceback."""
+    """What is wrong with the input in one sentence on stderr and exit code 2, without a traceback.
+
+    A signal that stops the training is told of too, with the exit code that a shell gives it.
+    """
     try:
         yield
     except (ValueError, OSError) as error:
         typer.echo(f"Error: {error}", err=True)
         raise typer.Exit(BAD_INPUT) from error
+    except Stopped as stopped:
+        typer.echo(str(stopped), err=True)
+        raise
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Training the map with Lightning: from scans, edges and starting poses to corrected poses and an occupancy network."""
 
 import math
+import signal
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,22 @@ from train.settling import MOVED, SettleWhenStill
 from train.surface_map import MapScore, SurfaceMap
 
 LEAF_SPEC = r"`isinstance\(treespec, LeafSpec\)` is deprecated"
+
+
+class Stopped(SystemExit):
+    """A signal ended the training before there was a map; ``code`` is what a shell expects: 128 and its number.
+
+    Parameters
+    ----------
+    number: SIGTERM or SIGINT.
+    """
+
+    def __init__(self, number: signal.Signals):
+        super().__init__(128 + number)
+        self.number = number
+
+    def __str__(self) -> str:
+        return f"{self.number.name} stopped the training before there was a map; --resume goes on from its last epoch"
 
 
 @dataclass(frozen=True)
@@ -63,6 +80,10 @@ def train_map(
     folder: gets ``checkpoints/`` and ``logs/``; a checkpoint found there is gone on from. None: nothing is written.
     progress: told each epoch.
     fast_dev_run: one step only, as Lightning has it; nothing is read or written.
+
+    Raises
+    ------
+    Stopped: a signal came; the checkpoint of the last whole epoch is there.
     """
     folder = None if fast_dev_run else folder
     data = MappingData(scans, edges, start, config=config.training, seed=config.seed)
@@ -96,13 +117,24 @@ def train_map(
 
 
 def _fit(trainer: L.Trainer, module: MappingModule, data: MappingData, folder: Path | None) -> None:
-    """Train, from the folder's checkpoint on if there is one."""
+    """Train, from the folder's checkpoint on if there is one.
+
+    Raises
+    ------
+    Stopped: a signal came.
+    """
     checkpoint = None if folder is None else folder / CHECKPOINTS / LAST
     found = checkpoint is not None and checkpoint.is_file()
     with warnings.catch_warnings():
         # Lightning 2.6 walks trees by a class that torch 2.13 renames; nothing for a user to act on.
         warnings.filterwarnings("ignore", message=LEAF_SPEC, category=FutureWarning)
-        trainer.fit(module, data, ckpt_path=checkpoint if found else None)
+        try:
+            trainer.fit(module, data, ckpt_path=checkpoint if found else None)
+        except SystemExit as error:
+            # Lightning makes one of both signals, with codes 0 and 1.
+            raise Stopped(signal.SIGTERM if trainer.received_sigterm else signal.SIGINT) from error
+    if trainer.received_sigterm:
+        raise Stopped(signal.SIGTERM)
 
 
 def _callbacks(best: KeepBest, folder: Path | None, progress: Progress) -> list[L.Callback]:
