@@ -13,6 +13,7 @@ from bbr_layer import read_poses, write_poses_tum
 from train.__main__ import app
 from train.config import load_config
 from train.console import _kept_sentence
+from train.device import PRESENT
 
 FAST = ("--epochs", "2")
 
@@ -137,11 +138,14 @@ def wrong(world, tmp_path):
         (["{world}", "--start", "{wrong}/seven.txt"], "holds 7 poses; the scans need 8"),
         (["{world}", "--term", "icp"], "training.term is 'icp': it must be one of"),
         (["{world}", "--device", "tpu"], "device is 'tpu'"),
+        (["{world}", "--device", "mps"], "device is 'mps', which torch does not find"),
+        (["{world}", "--seed", str(2**32)], "seed is 4294967296: input should be less than 4294967296"),
         (["{world}", "--stride", "8"], "needs at least 2"),
         (["--start", "{wrong}/seven.txt"], "poses were given without scans"),
     ],
 )
-def test_bad_input_is_told_and_nothing_is_written(wrong, world, arguments, words):
+def test_bad_input_is_told_and_nothing_is_written(wrong, world, arguments, words, monkeypatch):
+    monkeypatch.setitem(PRESENT, "mps", lambda: False)
     filled = [word.format(wrong=wrong, world=world) for word in arguments]
     assert words in refused("map", *filled, "--out", wrong / "out")
     assert not (wrong / "out").exists()

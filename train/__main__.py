@@ -12,6 +12,7 @@ from rich.console import Console
 from bbr_layer import read_poses
 from train.config import TERMS, load_config
 from train.console import PrintedUnit, one_sentence, show_map, show_metrics, shown_progress
+from train.device import check_device
 from train.evaluate import evaluate_trajectory
 from train.known_edges import KnownEdges
 from train.mapping import map_scans
@@ -74,6 +75,7 @@ def map_command(
     console, printed = Console(), PrintedUnit(unit_scale, unit if scans or unit else SIMULATED_UNIT)
     with one_sentence():
         settings = load_config(config, changes(term=term, epochs=epochs, stride=stride, seed=seed, device=device))
+        check_device(settings.device)
         with shown_progress(console) as progress:
             if scans:
                 given = read_scan_set(scans, start=start, truth=truth, stride=settings.stride, progress=progress)
@@ -112,6 +114,7 @@ def fit(
     console, printed = Console(), PrintedUnit(unit_scale, unit)
     with one_sentence():
         settings = load_config(config, changes(term=term, epochs=epochs, stride=stride, seed=seed, device=device))
+        check_device(settings.device)
         if edges is None and settings.training.term == "residual":
             raise ValueError("term residual compares poses with registered edges: give --edges, or another term")
         with shown_progress(console) as progress:

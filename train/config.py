@@ -12,6 +12,8 @@ from models import REGISTRATION_TERMS, TermSettings
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
+# 32 bits: what numpy, torch and Lightning all take.
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
 # The words that choose a registration term: the name models/ knows it by, and its settings. The best-buddies losses
 # each have a word of their own, the paper's.
 TERMS = {name: (name, TermSettings()) for name in REGISTRATION_TERMS if name != "buddy"} | {
@@ -110,12 +112,12 @@ class MapConfig(Settings):
 
     Parameters
     ----------
-    seed: of the networks' first weights, the drawn points and the order of the groups.
+    seed: of the networks' first weights, the drawn points and the order of the groups; below 2^32.
     stride: every how many-th scan is used.
     device: "cpu", "cuda", "mps", or "auto" for the best there is.
     """
 
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     stride: Count = 1
     device: Literal["auto", "cpu", "cuda", "mps"] = "cpu"
     edges: EdgeConfig = EdgeConfig()
