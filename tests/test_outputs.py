@@ -13,6 +13,7 @@ from PIL import Image
 
 from bbr_layer import read_cloud, read_poses, read_poses_tum
 from train.outputs import MapResult, write_outputs
+from train.run_folder import MAP_FILES
 
 ALWAYS = {
     *("poses_tum.txt", "poses.npz", "map.ply", "map.html", "metrics.json", "config.yaml"),
@@ -41,6 +42,7 @@ def small_pictures(monkeypatch):
 def test_all_files_are_there_and_the_pictures_are_pictures(run):
     d, _, out = run
     assert {path.name for path in out.iterdir()} == ALWAYS | EXTRA[d]
+    assert ALWAYS | EXTRA[3] | {"movers.ply"} == {*MAP_FILES, "config.yaml"}, "what another run takes away"
     for picture in out.glob("*.png"):
         with Image.open(picture) as image:
             image.verify()

@@ -14,7 +14,7 @@ from train.alignment import Alignment
 from train.checkpoints import LAST
 from train.data_module import prepare_scan
 from train.keep_best import SCORE
-from train.run_folder import open_run
+from train.run_folder import EDGES, MAP_FILES, open_run
 from train.settling import MOVED, trajectory_change
 from train.surface_map import MapScore, SurfaceMap
 from train.training import Stopped, train_map
@@ -238,7 +238,7 @@ def test_files_that_no_run_left_are_deleted_only_when_asked(tmp_path, name, resu
         open_run(tmp_path, small_world(), small_config(), resume=resume)
     assert mine.read_text() == "mine"
     open_run(tmp_path, small_world(), small_config(), overwrite=True)
-    assert not mine.exists() or name == "poses.npz"
+    assert not mine.exists()
     open_run(tmp_path, small_world(), small_config())
 
 
@@ -254,6 +254,23 @@ def test_a_run_killed_while_its_folder_is_cleared_is_still_known_as_one(tmp_path
     monkeypatch.undo()
     assert not (tmp_path / "checkpoints" / LAST).exists()
     open_run(tmp_path, small_world(), small_config(), resume=True)
+
+
+@pytest.mark.parametrize("asked", ["resume", "overwrite"])
+def test_a_map_of_something_else_does_not_stand_beside_the_new_run(tmp_path, opened, asked):
+    opened(small_world(), small_config())
+    for name in (*MAP_FILES, "config.yaml", "map.csv"):
+        (tmp_path / name).write_text("of the first run, or mine")
+    open_run(tmp_path, small_world(), small_config(), **{asked: True})
+    assert all((tmp_path / name).exists() for name in MAP_FILES), "the same run again replaces them when it is done"
+    open_run(tmp_path, small_world(), small_config(term="chamfer"), **{asked: True})
+    assert {path.name for path in tmp_path.iterdir() if path.is_file()} - {EDGES} == {"config.yaml", "map.csv"}
+
+
+def test_files_that_only_look_like_a_map_stay(tmp_path):
+    (tmp_path / "map.png").write_text("mine")
+    open_run(tmp_path, small_world(), small_config())
+    assert (tmp_path / "map.png").exists()
 
 
 def test_an_unfinished_run_of_other_settings_is_replaced(tmp_path, opened):

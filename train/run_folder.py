@@ -17,6 +17,12 @@ STATE = Path(CHECKPOINTS, "run.json")
 MAP = "poses.npz"
 # What a run without ``resume`` takes away.
 REPLACED = (EDGES, CHECKPOINTS, LOGS)
+# The files that show a map, the one that tells of it first. The settings, config.yaml, are not among them: a run may
+# have been given the very file.
+MAP_FILES = (
+    *(MAP, "poses_tum.txt", "poses_kitti.txt", "map.ply", "movers.ply", "map.html", "metrics.json"),
+    *("trajectory.png", "map.png", "losses.png", "occupancy.png", "occupancy.yaml", "occupancy_network.png"),
+)
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,8 @@ def open_run(
     """Make ready the folder of a run: keep what is to be gone on from, remove what belongs to another run.
 
     With ``resume``, edges stay when they belong to the same scans and edge settings, and a checkpoint when the
-    training settings are the same too; so other training settings begin a new training on the same edges.
+    training settings are the same too; so other training settings begin a new training on the same edges. A map of
+    other scans or settings is removed.
 
     Parameters
     ----------
@@ -62,7 +69,8 @@ def open_run(
         files that no run is known to have left and that this one would delete, and ``overwrite`` is not set.
     OSError: the folder cannot be written.
     """
-    if not overwrite:
+    ours = (path / STATE).exists()
+    if not (ours or overwrite):
         _refuse_files_of_others(path)
     wanted, earlier = _state(scans, config, origin), _read_state(path)
     same = {key: earlier.get(key) == value for key, value in wanted.items()}
@@ -74,6 +82,10 @@ def open_run(
     registered = resume and same["scans"] and same["edges"]
     begun = registered and same["training"]
     _make_folder(path / CHECKPOINTS)
+    if (ours or overwrite) and not all(same.values()):
+        # A map of other scans or settings must not stand beside the state of this run.
+        for name in MAP_FILES:
+            (path / name).unlink(missing_ok=True)
     if not registered:
         (path / EDGES).unlink(missing_ok=True)
     if not begun:
@@ -85,8 +97,6 @@ def open_run(
 
 def _refuse_files_of_others(path: Path) -> None:
     """A folder without the state of a run is not ours to clear; empty folders are nothing to lose."""
-    if (path / STATE).exists():
-        return
     found = [name for name in (*REPLACED, MAP) if (path / name).is_file() or any((path / name).glob("*"))]
     if found:
         raise ValueError(
