@@ -41,7 +41,7 @@ def test_loops_join_scans_that_stand_close():
 def test_a_file_of_edges_goes_with_the_given_poses(tmp_path):
     scans = small_world()
     given = displaced(true_poses(scans), 0.1)
-    save_edges(tmp_path / "edges.npz", true_edges(scans), true_poses(scans))
+    save_edges(tmp_path / "edges.npz", true_edges(scans), true_poses(scans), scans)
     known = KnownEdges(tmp_path / "edges.npz")
     edges, poses = known(with_start(scans, given), EdgeConfig())
     assert pairs(edges) == pairs(true_edges(scans))
@@ -51,7 +51,7 @@ def test_a_file_of_edges_goes_with_the_given_poses(tmp_path):
 def test_the_origin_tells_files_apart(tmp_path):
     scans = small_world()
     for name, metres in (("a", 0.0), ("b", 0.1)):
-        save_edges(tmp_path / f"{name}.npz", true_edges(scans), displaced(true_poses(scans), metres))
+        save_edges(tmp_path / f"{name}.npz", true_edges(scans), displaced(true_poses(scans), metres), scans)
     origins = {KnownEdges(path).origin for path in (None, tmp_path / "a.npz", tmp_path / "b.npz")}
     assert len(origins) == 3
     with pytest.raises(FileNotFoundError, match="no such file of edges"):

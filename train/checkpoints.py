@@ -1,6 +1,8 @@
 """The checkpoint that a killed training goes on from: one file, replaced whole after every epoch."""
 
 import io
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import lightning as L
@@ -9,6 +11,7 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
 from bbr_layer import atomic_write
+from train.damage import DAMAGED
 
 # The file in the folder of checkpoints.
 LAST = "last.ckpt"
@@ -48,3 +51,23 @@ class WholeCheckpoints(TorchCheckpointIO):
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary:
             temporary.write_bytes(whole.getbuffer())
+
+    def load_checkpoint(
+        self,
+        path: str | Path,
+        map_location: Callable | None = lambda storage, place: storage,
+        weights_only: bool | None = None,
+    ) -> dict[str, object]:
+        """Lightning's own, of a file whose every byte is as it was written.
+
+        Raises
+        ------
+        ValueError: the file is damaged.
+        """
+        try:
+            with zipfile.ZipFile(path) as archive:
+                if (part := archive.testzip()) is not None:
+                    raise zipfile.BadZipFile(f"bad checksum of {part}")
+            return super().load_checkpoint(path, map_location, weights_only)
+        except DAMAGED as error:
+            raise ValueError(f"{path} is damaged ({error}); delete it to train again on the same edges") from error

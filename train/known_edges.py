@@ -49,7 +49,7 @@ class KnownEdges:
         if scans.start is None:
             raise ValueError("the scans came without poses; give their file, or map them")
         poses = RigidMotion.from_matrix(torch.from_numpy(scans.start))
-        edges = neighbouring(scans, poses, config) if self.path is None else load_edges(self.path, len(scans))[0]
+        edges = neighbouring(scans, poses, config) if self.path is None else load_edges(self.path, scans)[0]
         progress("edges", len(edges.target), len(edges.target))
         return edges, poses
 

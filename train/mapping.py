@@ -84,9 +84,9 @@ def registered(
     """The edges in the folder of the run, or else new ones, which are put there."""
     path = run.path / EDGES
     if not run.registered:
-        save_edges(path, *register(scans, config.edges, progress))
+        save_edges(path, *register(scans, config.edges, progress), scans)
     # Read back even when new: an unbroken run and a resumed one then start from the same bits.
-    return load_edges(path, len(scans))
+    return load_edges(path, scans)
 
 
 @contextmanager

@@ -73,8 +73,15 @@ class ScanSet:
 
     def fingerprint(self) -> str:
         """The same for the same points and starting poses, whatever their files are called."""
+        return self._digest(*(() if self.start is None else (self.start,)))
+
+    def points_fingerprint(self) -> str:
+        """The same for the same points, wherever the scans stand."""
+        return self._digest()
+
+    def _digest(self, *others: np.ndarray) -> str:
         digest = hashlib.sha256(str([scan.shape for scan in self.points]).encode())
-        for array in (*self.points, *(() if self.start is None else (self.start,))):
+        for array in (*self.points, *others):
             digest.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
         return digest.hexdigest()
 
