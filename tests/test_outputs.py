@@ -13,7 +13,7 @@ from PIL import Image
 
 from bbr_layer import read_cloud, read_poses, read_poses_tum
 from train.outputs import MapResult, write_outputs
-from train.run_folder import MAP_FILES
+from train.run_folder import MAP, MAP_FILES
 
 ALWAYS = {
     *("poses_tum.txt", "poses.npz", "map.ply", "map.html", "metrics.json", "config.yaml"),
@@ -118,6 +118,7 @@ def test_a_picture_that_fails_leaves_no_half_file(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         write_outputs(tmp_path, room_result())
     assert not list(tmp_path.glob("*trajectory*"))
+    assert (tmp_path / "poses_tum.txt").exists() and not (tmp_path / MAP).exists(), "a map is there once all of it is"
 
 
 def test_progress_and_metrics_are_told(tmp_path):

@@ -20,6 +20,7 @@ from train.pose_graph import Edges
 from train.poses import embed_poses
 from train.report import map_metrics, write_json, write_yaml
 from train.ros_map import write_ros_map
+from train.run_folder import MAP
 from train.scans import Progress, ScanSet, silent
 
 # Kind of edge that joins scans far apart in time.
@@ -72,8 +73,8 @@ def write_outputs(out: str | Path, result: MapResult, progress: Progress = silen
     ``poses_tum.txt``, ``poses_kitti.txt`` (3D), ``poses.npz``; ``map.ply`` with, of each point, the number of its scan
     and the share of other scans that saw through it; ``movers.ply``, the points that more scans saw through than found
     and that therefore left the map; ``trajectory.png``, ``map.png``, ``losses.png``; ``occupancy.png`` with
-    ``occupancy.yaml`` (map_server), ``occupancy_network.png``; ``map.html``; ``metrics.json``; ``config.yaml``. Returns
-    what ``metrics.json`` holds.
+    ``occupancy.yaml`` (map_server), ``occupancy_network.png``; ``map.html``; ``metrics.json``; ``config.yaml``. Last of
+    all ``poses.npz``: where it is, the rest is too. Returns what ``metrics.json`` holds.
 
     Raises
     ------
@@ -90,7 +91,7 @@ def write_outputs(out: str | Path, result: MapResult, progress: Progress = silen
     everything = result.world_points()
     moving = MovingPoints(result.scans, result.edges, result.world_from_scan)
     points = everything[~moving.moved]
-    _write_poses(folder, result)
+    _write_trajectories(folder, result)
     write_yaml(folder / "config.yaml", result.settings)
     metrics = map_metrics(result.scans, result.world_from_scan, points, result.edges)
     metrics |= {"unit": result.unit, "timings": result.timings, "losses": result.losses}
@@ -106,6 +107,7 @@ def write_outputs(out: str | Path, result: MapResult, progress: Progress = silen
         save_picture(draw(), folder / name)
         progress("pictures", number + 1, len(pictures))
     write_browser_map(folder / "map.html", points, result.positions, result.unit, names=result.scans.names)
+    _write_poses(folder / MAP, result)
     return metrics
 
 
@@ -119,15 +121,19 @@ def _check(result: MapResult) -> None:
         raise ValueError(f"world_from_scan is not finite, first at scan {name}; the map diverged: lower its rates")
 
 
-def _write_poses(folder: Path, result: MapResult) -> None:
-    poses, scans = embed_poses(result.world_from_scan), result.scans
-    write_poses_tum(folder / "poses_tum.txt", poses, scans.timestamps)
-    if scans.dimension == 3:
+def _write_trajectories(folder: Path, result: MapResult) -> None:
+    poses = embed_poses(result.world_from_scan)
+    write_poses_tum(folder / "poses_tum.txt", poses, result.scans.timestamps)
+    if result.scans.dimension == 3:
         write_poses_kitti(folder / "poses_kitti.txt", poses)
-    arrays: dict[str, Any] = {"world_from_scan": poses, "timestamps": scans.timestamps, "names": np.array(scans.names)}
-    known = {"start": scans.start, "truth": scans.truth}
-    arrays |= {name: embed_poses(given) for name, given in known.items() if given is not None}
-    with atomic_write(folder / "poses.npz") as temporary:
+
+
+def _write_poses(path: Path, result: MapResult) -> None:
+    scans = result.scans
+    named = {"world_from_scan": result.world_from_scan, "start": scans.start, "truth": scans.truth}
+    arrays: dict[str, Any] = {name: embed_poses(poses) for name, poses in named.items() if poses is not None}
+    arrays |= {"timestamps": scans.timestamps, "names": np.array(scans.names)}
+    with atomic_write(path) as temporary:
         np.savez_compressed(temporary, **arrays)
 
 
