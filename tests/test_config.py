@@ -38,6 +38,8 @@ def test_every_term_is_one_word(term):
         ("training: {epoch: 3}", "training.epoch is no setting; there are term, epochs"),
         ("training: {term: icp}", "training.term is 'icp': it must be one of none, chamfer"),
         ("training: {epochs: -1}", "training.epochs is -1: input should be greater than or equal to 0"),
+        ("training: {warm_up: 0.8, settle: 0.3}", "warm_up 0.8 and settle 0.3 are more than all epochs; make the two"),
+        ("training: {warm_up: 0.9}", "training is {'warm_up': 0.9}: warm_up 0.9 and settle 0.2 are more than all"),
         ("edges: {window: two}", "edges.window is 'two': input should be a valid integer"),
         ("training: 5", "training is 5: "),
         ("device: tpu", "device is 'tpu': input should be"),
@@ -61,3 +63,8 @@ def test_a_missing_file(tmp_path):
 def test_settings_do_not_change():
     with pytest.raises(ValueError, match="frozen"):
         MapConfig().seed = 1
+
+
+def test_shares_may_be_all_of_the_epochs():
+    training = load_config(None, {"training": {"warm_up": 0.7, "settle": 0.3}}).training
+    assert training.warm_up + training.settle == 1

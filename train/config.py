@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from bbr_layer import atomic_write
 from models import REGISTRATION_TERMS, TermSettings
@@ -61,9 +61,9 @@ class TrainingConfig(Settings):
     adjust: begin at the poses at which the map of all scans is thinnest, where the score agrees.
     keep: "best", the poses that align held-out points best, the starting ones included; "last", where the training
         ends, better or not: to compare registration terms.
-    warm_up, settle: shares of the epochs, at the beginning and at the end, in which only the occupancy network
-        learns: first the starting map, before it may move a pose; at last, earlier where poses no longer move, the map
-        of the poses that were kept.
+    warm_up, settle: shares of the epochs, at most 1 together, at the beginning and at the end, in which only the
+        occupancy network learns: first the starting map, before it may move a pose; at last, earlier where poses no
+        longer move, the map of the poses that were kept.
     group: consecutive scans in one step; the partners of their loop edges come on top.
     points: most points of a scan in one step, drawn anew in every epoch.
     free_samples: points of free space per ray.
@@ -98,6 +98,13 @@ class TrainingConfig(Settings):
         """The rate given, or that of the kind of localisation."""
         rate = self.localisation_rate
         return LOCALISATION_RATES[self.localisation] if rate is None else rate
+
+    @model_validator(mode="after")
+    def _not_more_than_all(self) -> "TrainingConfig":
+        if self.warm_up + self.settle > 1 + 1e-9:  # decimal shares may add up to a rounding more
+            both = f"warm_up {self.warm_up} and settle {self.settle}"
+            raise ValueError(f"{both} are more than all epochs; make the two at most 1 together")
+        return self
 
     @field_validator("term")
     @classmethod

@@ -17,7 +17,7 @@ class Schedule(NamedTuple):
     def of(cls, config: TrainingConfig) -> "Schedule":
         """The shares rounded down, so that a short training still has a joint phase."""
         warm_up, settle = int(config.warm_up * config.epochs), int(config.settle * config.epochs)
-        return cls(warm_up, max(config.epochs - warm_up - settle, 0), settle)
+        return cls(warm_up, config.epochs - warm_up - settle, settle)
 
     @property
     def epochs(self) -> int:
