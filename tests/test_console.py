@@ -4,10 +4,14 @@ import io
 import signal
 
 import pytest
+import torch
+from map_problems import room_result
 from rich.console import Console
 
+from bbr_layer import RigidMotion
 from train import console as module
-from train.console import one_sentence, shown_progress
+from train.console import PrintedUnit, one_sentence, show_map, show_metrics, shown_progress
+from train.mapping import Mapped
 from train.training import Stopped
 
 
@@ -61,3 +65,15 @@ def test_a_signal_is_told_of_with_the_exit_code_of_a_shell(capsys):
     assert ended.value.code == 143
     told = capsys.readouterr().err
     assert told.startswith("SIGTERM stopped the training") and told.count("\n") == 1
+
+
+def test_brackets_in_names_are_no_markup(tmp_path):
+    log, out = io.StringIO(), tmp_path / "run[" / "a] :dog: [red]"
+    out.mkdir(parents=True)
+    (out / "poses.npz").touch()
+    start = RigidMotion.from_matrix(torch.from_numpy(room_result().world_from_scan))
+    show_map(Console(file=log, width=80), out, Mapped(room_result(), start, 0), PrintedUnit(1.0, "[m]"))
+    show_metrics(Console(file=log, width=80), {"ape_rmse": 2.0}, PrintedUnit(1.0, "[/m]"))
+    assert f"trajectory {out / 'poses.npz'}\n" in log.getvalue()
+    assert " [m]\n" in log.getvalue() or " [m] " in log.getvalue()
+    assert "ape_rmse                  2 [/m]\n" in log.getvalue()

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from train.evaluate import evaluate_trajectory
 from train.keep_best import SCORE
@@ -112,7 +113,7 @@ def show_map(console: Console, out: Path, mapped: Mapped, unit: PrintedUnit) -> 
     for title, names in SHOWN.items():
         found = [str(out / name) for name in names if (out / name).exists()]
         if found:
-            console.print(f"{title:<11}{found[0]}", *found[1:], sep="\n           ", soft_wrap=True, highlight=False)
+            _print_verbatim(console, f"{title:<11}" + "\n           ".join(found))
 
 
 def show_metrics(
@@ -121,7 +122,12 @@ def show_metrics(
     """A line for each number; ``before``: the same of the map before the training."""
     for name in metrics:
         shown, earlier = (_printed(name, m.get(name), unit) for m in (metrics, before or {}))
-        console.print(f"{name:<26}{shown}" + (f"   (edges' map {earlier})" if earlier else ""), highlight=False)
+        _print_verbatim(console, f"{name:<26}{shown}" + (f"   (edges' map {earlier})" if earlier else ""))
+
+
+def _print_verbatim(console: Console, text: str) -> None:
+    """As it is: names of files and units may hold what rich takes for markup, such as ``[a]``."""
+    console.print(Text(text), soft_wrap=True, highlight=False)
 
 
 def _printed(name: str, value: float | None, unit: PrintedUnit) -> str:
