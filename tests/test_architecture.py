@@ -88,7 +88,8 @@ ORDER = {
         map_entropy occupancy_grid poses
         evaluate drawing ros_map
         curves pictures browser_map
-        config scans device damage
+        config scan_checks device damage
+        scans
         prepared pose_graph consensus
         surfaces edge_files report run_folder checkpoints
         shape_features refinement

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bbr_layer import read_cloud, read_poses, read_scans, scan_paths
+from train.scan_checks import check_scan
 
 # Told a stage, how much of it is done, and of how much.
 Progress = Callable[[str, int, int], None]
@@ -34,8 +35,7 @@ class ScanSet:
 
     Raises
     ------
-    ValueError: fewer than 2 scans, mixed dimensions, a scan of fewer than d points, NaN, or numbers that do not fit
-        together.
+    ValueError: fewer than 2 scans, mixed dimensions, numbers that do not fit together, or as ``check_scan``.
     """
 
     points: list[Float[np.ndarray, "_ d"]]
@@ -53,11 +53,7 @@ class ScanSet:
         for name, scan in zip(self.names, self.points, strict=True):
             if scan.ndim != 2 or scan.shape[1] != self.dimension or scan.shape[1] not in (2, 3):
                 raise ValueError(f"scan {name} has shape {scan.shape}; all scans must be (n, 2), or all (n, 3)")
-            if not np.isfinite(scan).all():
-                raise ValueError(f"scan {name} is not finite; leave it out")
-            if len(scan) < self.dimension:
-                needed = f"in {self.dimension}D at least {self.dimension} are needed"
-                raise ValueError(f"scan {name} has {len(scan)} points; {needed}: leave it out")
+            check_scan(name, scan)
         side = self.dimension + 1
         for role, poses in (("start", self.start), ("truth", self.truth)):
             if poses is not None and poses.shape != (k, side, side):
