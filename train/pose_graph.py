@@ -129,10 +129,16 @@ def _graduation(widest: float) -> list[float]:
 
 
 def _weights(edges: Edges, poses: RigidMotion, root: Tensor, width: float) -> Tensor:
-    """Geman-McClure's weight of each edge, the kernel ``width`` times its final width."""
+    """Geman-McClure's weight of each edge, the kernel ``width`` times its final width.
+
+    Edges between copies of a scan, which stay in place to the last bit, say nothing of how exact the others are.
+    """
     sizes = torch.linalg.vector_norm(_residuals(edges, poses, root), dim=-1)
-    typical = torch.linalg.vector_norm(edges.target_from_source.translation, dim=-1).median()
-    scale = sizes.median().clamp(min=RESIDUAL_FLOOR * float(typical))
+    lengths = torch.linalg.vector_norm(edges.target_from_source.translation, dim=-1)
+    moving = lengths > RESIDUAL_FLOOR * lengths.max()
+    if not moving.any():
+        return torch.ones_like(sizes)
+    scale = sizes[moving].median().clamp(min=RESIDUAL_FLOOR * float(lengths[moving].median()))
     return (1 + (sizes / (width * FINAL_WIDTH * scale)).square()).pow(-2)
 
 
