@@ -42,6 +42,14 @@ def test_one_point_off_the_plane_makes_all_scans_3d(folder):
     assert read_scan_set([folder]).dimension == 3
 
 
+def test_a_point_too_far_to_have_been_seen_is_left_out_and_told(folder):
+    points = read_scan_set([folder]).points
+    write_cloud(folder / "scan5.ply", np.column_stack((np.insert(points[5], 3, [65535, 0], axis=0), np.zeros(9))))
+    scans = read_scan_set([folder])
+    np.testing.assert_array_equal(scans.points[5], points[5])
+    assert len(scans.notes) == 1 and "1 in scan5.ply" in scans.notes[0]
+
+
 def test_files_are_read_in_the_order_given(folder):
     scans = read_scan_set([folder / "scan7.ply", folder / "scan2.ply"])
     assert scans.names == ["scan7.ply", "scan2.ply"]

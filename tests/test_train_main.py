@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bbr_layer import read_poses, write_poses_tum
+from bbr_layer import read_cloud, read_poses, write_cloud, write_poses_tum
 from train.__main__ import app
 from train.config import load_config
 from train.console import _kept_sentence
@@ -102,6 +103,16 @@ def test_fit_trains_from_known_poses(finished, world, tmp_path):
     assert read_poses(tmp_path / "a" / "poses.npz")[0] == pytest.approx(read_poses(poses)[0])
     sentence = refused("fit", world, "--poses", poses, "--term", "residual", "--out", tmp_path / "b")
     assert "give --edges" in sentence and not (tmp_path / "b").exists()
+
+
+def test_what_was_left_out_of_the_scans_is_printed_and_kept(world, tmp_path):
+    shutil.copytree(world, tmp_path / "scans")
+    points = read_cloud(world / "002.ply").points
+    write_cloud(tmp_path / "scans" / "002.ply", np.concatenate((points, [[65535.0, 0.0, 0.0]])))
+    result = run("map", tmp_path / "scans", "--out", tmp_path / "out", "--epochs", 0)
+    assert result.exit_code == 0, result.output
+    assert "Note: points that lie farther than" in result.stdout and "1 in 002.ply" in result.stdout
+    assert "1 in 002.ply" in json.loads((tmp_path / "out" / "metrics.json").read_text())["notes"][0]
 
 
 def test_without_scans_a_world_is_simulated(tmp_path):

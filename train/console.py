@@ -99,7 +99,9 @@ def _in_lines(console: Console) -> Report:
 
 
 def show_map(console: Console, out: Path, mapped: Mapped, unit: PrintedUnit) -> None:
-    """Which epoch was kept, the errors where there is a truth, and the files."""
+    """What was done to the scans, which epoch was kept, the errors where there is a truth, and the files."""
+    for note in mapped.result.scans.notes:
+        console.print(f"Note: {note}.", soft_wrap=True, highlight=False, markup=False)
     curve = mapped.result.losses.get(SCORE, [])
     if curve:
         adjusted = mapped.kept_epoch == 0 and not np.allclose(

@@ -94,7 +94,7 @@ def write_outputs(out: str | Path, result: MapResult, progress: Progress = silen
     _write_trajectories(folder, result)
     write_yaml(folder / "config.yaml", result.settings)
     metrics = map_metrics(result.scans, result.world_from_scan, points, result.edges)
-    metrics |= {"unit": result.unit, "timings": result.timings, "losses": result.losses}
+    metrics |= {"unit": result.unit, "notes": result.scans.notes, "timings": result.timings, "losses": result.losses}
     metrics["moving_points"] = int(moving.moved.sum())
     write_json(folder / "metrics.json", metrics)
     _write_map(folder / "map.ply", result, everything, moving, ~moving.moved)

@@ -1,4 +1,6 @@
-"""What a scan must be like to be mapped."""
+"""What a scan must be like to be mapped, and what is left out of one so that it is."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -7,6 +9,13 @@ from jaxtyping import Float
 # simulated scans of a plane and of space, shifted: up to here their points end where unshifted ones do, at 40 000 times
 # a metre off, as float32 no longer resolves them. Scans of a sensor, or of an object before one, have at most 4.
 FARTHEST_ORIGIN = 1000.0
+# Points farther than this many times the range within which this share of all points lies were not seen: codes for no
+# return (65535), slips of a digit. In the sequences of benchmarks/mapping_table.md the farthest one is at 14 times.
+FARTHEST_POINT, MOST_POINTS = 100.0, 0.75
+# Of a scan that would lose more than this share, not its points but its frame or its unit is wrong.
+MOST_LOST = 0.5
+# So many scans are named in a sentence.
+NAMED = 5
 
 
 def check_scan(name: str, scan: Float[np.ndarray, "n d"]) -> None:
@@ -29,3 +38,32 @@ def check_scan(name: str, scan: Float[np.ndarray, "n d"]) -> None:
             "origin, as in coordinates of a country: subtract from each scan the place of its sensor, or one place "
             "among them from all"
         )
+
+
+def without_far_points(
+    scans: list[Float[np.ndarray, "_ d"]], names: Sequence[str]
+) -> tuple[list[Float[np.ndarray, "_ d"]], list[str]]:
+    """The scans without points that are too far to have been seen, and a sentence on them if there were any.
+
+    Raises
+    ------
+    ValueError: more than half of a scan would go.
+    """
+    with np.errstate(over="ignore"):
+        ranges = [np.linalg.norm(scan, axis=1) for scan in scans]
+    seen = np.concatenate(ranges)
+    seen = seen[seen > 0]
+    limit = FARTHEST_POINT * float(np.quantile(seen, MOST_POINTS, method="lower")) if len(seen) else np.inf
+    lost = {number: int((far > limit).sum()) for number, far in enumerate(ranges) if (far > limit).any()}
+    reason = f"farther than {limit:.4g} from their sensor, {FARTHEST_POINT:g} times as far as most points of all scans"
+    for number, count in lost.items():
+        if count > MOST_LOST * len(scans[number]):
+            whole = f"of the {len(scans[number])} points of scan {names[number]} {count} lie {reason}"
+            raise ValueError(f"{whole}: leave it out, or give it in its sensor's frame and the unit of the others")
+    if not lost:
+        return scans, []
+    named = [f"{count} in {names[number]}" for number, count in lost.items()]
+    if len(named) > NAMED:
+        named[NAMED:] = [f"and others in {len(named) - NAMED} more scans"]
+    kept = [scan[far <= limit] for scan, far in zip(scans, ranges, strict=True)]
+    return kept, [f"points that lie {reason} were left out: {', '.join(named)}"]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bbr_layer import read_cloud, read_poses, read_scans, scan_paths
-from train.scan_checks import check_scan
+from train.scan_checks import check_scan, without_far_points
 
 # Told a stage, how much of it is done, and of how much.
 Progress = Callable[[str, int, int], None]
@@ -32,6 +32,7 @@ class ScanSet:
     timestamps: ``(k,)`` seconds, or the number of the scan.
     start: ``world_from_scan`` given by the user, ``(k, d + 1, d + 1)``; None: not known.
     truth: the true ``world_from_scan``, for the report only; None: not known.
+    notes: what was done to the scans when they were read, in sentences for the user.
 
     Raises
     ------
@@ -43,6 +44,7 @@ class ScanSet:
     timestamps: Float[np.ndarray, " k"]
     start: Float[np.ndarray, "k d1 d1"] | None = None
     truth: Float[np.ndarray, "k d1 d1"] | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         k = len(self.points)
@@ -92,7 +94,8 @@ def read_scan_set(
 ) -> ScanSet:
     """Read a folder of scans, several files, or one .npz of several scans.
 
-    Scans are planar (d = 2) when every z of every scan is 0 or missing.
+    Scans are planar (d = 2) when every z of every scan is 0 or missing. Points too far to have been seen are left out;
+    ``notes`` of the answer says so.
 
     Parameters
     ----------
@@ -103,11 +106,13 @@ def read_scan_set(
 
     Raises
     ------
-    FileNotFoundError, ValueError: as ``scan_paths``, ``read_cloud`` and ``read_poses``; poses of another number.
+    FileNotFoundError, ValueError: as ``scan_paths``, ``read_cloud``, ``read_poses``, ``without_far_points`` and
+        ``ScanSet``; poses of another number.
     """
     if not sources or stride < 1:
         raise ValueError(f"{len(sources)} sources and stride {stride} were given; both must be at least 1")
     scans, names, total = _read_points(sources, stride, progress)
+    scans, notes = without_far_points(scans, names)
     if all(scan.shape[1] == 2 or not scan[:, 2].any() for scan in scans):
         scans = [np.ascontiguousarray(scan[:, :2]) for scan in scans]
     flat = scans[0].shape[1] == 2
@@ -116,7 +121,7 @@ def read_scan_set(
         for role, path in (("start", start), ("truth", truth))
     }
     timestamps = np.arange(total, dtype=np.float64)[::stride]
-    return ScanSet(scans, names, timestamps, start=poses["start"], truth=poses["truth"])
+    return ScanSet(scans, names, timestamps, start=poses["start"], truth=poses["truth"], notes=tuple(notes))
 
 
 def _read_points(sources: Sequence[Path], stride: int, progress: Progress) -> tuple[list[np.ndarray], list[str], int]:
