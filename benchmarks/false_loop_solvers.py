@@ -14,10 +14,11 @@ from train.agreement import agreed_poses
 from train.config import EdgeConfig
 from train.edges import refined, register_edges
 from train.loops import DOUBTED
-from train.pose_graph import Edges, solve_pose_graph, spanning_poses
+from train.pose_graph import Edges, solve_pose_graph
 from train.prepared import prepare, thinned
 from train.scans import Progress, ScanSet, silent
 from train.scene import build_scene
+from train.spanning_tree import spanning_poses
 
 
 class Solved(NamedTuple):

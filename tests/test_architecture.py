@@ -91,7 +91,7 @@ ORDER = {
         config scan_checks device damage
         scans
         prepared pose_graph consensus
-        surfaces edge_files report run_folder checkpoints
+        surfaces edge_files report run_folder checkpoints spanning_tree
         shape_features refinement
         free_space_evidence planes
         scene moving_points

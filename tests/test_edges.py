@@ -11,10 +11,11 @@ from train.chain import POOR, consecutive
 from train.config import EdgeConfig
 from train.edges import NEAR, register_edges
 from train.loops import DOUBTED, again
-from train.pose_graph import Edges, solve_pose_graph, spanning_poses
+from train.pose_graph import Edges, solve_pose_graph
 from train.prepared import prepare
 from train.scans import ScanSet, silent
 from train.scene import build_scene
+from train.spanning_tree import spanning_poses
 
 
 def _circle(scans: int, d: int) -> RigidMotion:

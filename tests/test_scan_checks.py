@@ -5,7 +5,7 @@ import pytest
 from map_problems import square_room
 
 from bbr_layer import read_scans
-from train.scan_checks import check_scan, without_far_points
+from train.scan_checks import check_scan, without_far_points, without_height
 
 REAL_SEQUENCES = (
     *("3dmatch_kitchen_0_1_4_5", "balm_realworld_30-108", "deepmapping2d_v1_pose0", "iclnuim_livingroom_0-120"),
@@ -53,3 +53,21 @@ def test_real_sequences_lose_no_point(real_data, name):
     assert notes == [] and all(one is other for one, other in zip(kept, scans, strict=True))
     for scan in scans:
         check_scan(name, scan)
+
+
+@pytest.mark.parametrize(("height", "shaken"), [(0.3, 0.0), (0.3, 3e-7), (0.0, 1e-9), (-12.5, 1e-9)])
+def test_points_at_one_height_are_planar_and_the_height_is_told(rng, height, shaken):
+    rooms = [square_room(place) for place in rng.uniform(-1, 1, size=(3, 2))]
+    heights = [height + shaken * rng.uniform(-1, 1, size=len(room)) for room in rooms]
+    flat, notes = without_height([np.column_stack(both) for both in zip(rooms, heights, strict=True)])
+    assert all(np.array_equal(one, room) for one, room in zip(flat, rooms, strict=True))
+    assert len(notes) == 1 and "all points lie at z = " in notes[0]
+
+
+def test_planar_scans_are_not_spoken_of_and_heights_that_differ_stay(rng):
+    room = square_room(np.zeros(2))
+    at_zero = np.column_stack((room, np.zeros(len(room))))
+    assert without_height([at_zero, room])[0][0].shape == room.shape and without_height([at_zero, room])[1] == []
+    for other in (at_zero + [0, 0, 1e-4], at_zero + 1e-4 * rng.normal(size=(len(room), 1))):
+        kept, notes = without_height([at_zero, other])
+        assert kept[1] is other and notes == []

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from bbr_layer import write_cloud, write_poses_kitti, write_poses_tum
+from bbr_layer import read_cloud, write_cloud, write_poses_kitti, write_poses_tum
 from train.scans import ScanSet, planar_poses, read_scan_set
 
 
@@ -40,6 +40,13 @@ def test_a_folder_is_read_in_natural_order_and_planar(folder):
 def test_one_point_off_the_plane_makes_all_scans_3d(folder):
     write_cloud(folder / "scan5.ply", np.array([[1.0, 1.0, 0.5], [1.0, 2.0, 0.0], [2.0, 1.0, 0.0]]))
     assert read_scan_set([folder]).dimension == 3
+
+
+def test_scans_at_one_height_are_planar_and_their_height_is_told(folder):
+    for path in folder.glob("*.ply"):
+        write_cloud(path, read_cloud(path).points + [0, 0, 0.3])
+    scans = read_scan_set([folder])
+    assert scans.dimension == 2 and scans.notes == ("all points lie at z = 0.3; they are mapped in the plane",)
 
 
 def test_a_point_too_far_to_have_been_seen_is_left_out_and_told(folder):

@@ -11,12 +11,14 @@ from train.free_space_evidence import point_evidence
 from train.given_motion import clear, with_given, without_given
 from train.loops import DOUBTED, again, apart_in_time, loops, point_weights
 from train.pair_registration import register_pairs
-from train.pose_graph import Edges, disagreement, solve_pose_graph, spanning_poses
+from train.pose_graph import Edges, disagreement, solve_pose_graph
 from train.prepared import Prepared, prepare, thinned
 from train.recognition import recognised
 from train.refinement import refine
+from train.scan_checks import check_depth
 from train.scans import Progress, ScanSet, silent
 from train.scene import Scene, build_scene
+from train.spanning_tree import spanning_poses
 from train.surfaces import Surface, surfaces
 from train.usual_speed import at_usual_speed
 
@@ -47,7 +49,13 @@ def register_edges(scans: ScanSet, config: EdgeConfig, progress: Progress = sile
     -------
     The registered edges, their score the lower the less they were believed, and ``world_from_scan (k, ...)``; the
     first pose is the given one, or the identity.
+
+    Raises
+    ------
+    ValueError: scans in space that are all flat.
     """
+    if scans.dimension == 3:
+        check_depth(scans.points)
     full = prepare(scans, max(config.points, config.refined_points))
     scene = build_scene(scans, thinned(full, config.points))
     edges, poses, belief = _closed(scene, _window(scene, scans, config, progress), config, progress)

@@ -6,13 +6,13 @@ no kind of edge is privileged.
 """
 
 import math
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.sparse import bsr_array, csc_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-from scipy.sparse.linalg import spsolve
+from scipy.sparse import bsr_array, csc_array
+from scipy.sparse.linalg import MatrixRankWarning, spsolve
 from torch import Tensor
 
 from bbr_layer import RigidMotion
@@ -67,34 +67,6 @@ class Edges(NamedTuple):
         return Edges(torch.cat((self.target, other.target)), torch.cat((self.source, other.source)), motion, *rest)
 
 
-def spanning_poses(edges: Edges, scans: int) -> RigidMotion:
-    """``world_from_scan`` along the tree of the best edges, the first scan at the origin, ``(scans, ...)``.
-
-    Raises
-    ------
-    ValueError: the edges do not join all scans.
-    """
-    d = edges.centre.shape[-1]
-    numbers = (edges.target.numpy(), edges.source.numpy())
-    # Costs are positive, as a sparse 0 would be no edge; of two edges of one pair the best is left.
-    costs = 2.0 - edges.score.clamp(0, 1).numpy()
-    best = {(int(numbers[0][edge]), int(numbers[1][edge])): edge for edge in np.argsort(-costs).tolist()}
-    kept = np.array(list(best.values()))
-    graph = csr_array((costs[kept], (numbers[0][kept], numbers[1][kept])), shape=(scans, scans))
-    order, before = breadth_first_order(minimum_spanning_tree(graph), 0, directed=False)
-    if len(order) != scans:
-        raise ValueError(f"{len(kept)} edges join {len(order)} scans to the first; there are {scans} to be joined")
-    poses = {0: RigidMotion.identity(d)}
-    for scan in order[1:].tolist():
-        last = int(before[scan])
-        forth = best.get((last, scan))
-        motion = edges.target_from_source
-        poses[scan] = poses[last] @ (
-            motion.item(forth) if forth is not None else motion.item(best[scan, last]).inverse()
-        )
-    return RigidMotion(*(torch.stack(field) for field in zip(*(poses[scan] for scan in range(scans)), strict=True)))
-
-
 def solve_pose_graph(edges: Edges, start: RigidMotion, *, near: bool = False) -> tuple[RigidMotion, Tensor]:
     """Poses that the edges agree on, and how much each edge was believed, ``(e,)`` in [0, 1].
 
@@ -103,6 +75,10 @@ def solve_pose_graph(edges: Edges, start: RigidMotion, *, near: bool = False) ->
     edges: at least a chain.
     start: ``world_from_scan (k, ...)`` to begin at; the first is kept.
     near: the start is nearly right; edges that it contradicts count little from the first step on.
+
+    Raises
+    ------
+    ValueError: the edges say nothing of some pose.
     """
     root = _information_root(edges)
     widths = _graduation(NEAR_WIDTH if near else START_WIDTH)
@@ -112,6 +88,11 @@ def solve_pose_graph(edges: Edges, start: RigidMotion, *, near: bool = False) ->
         for _ in range(STEPS_PER_ROUND):
             poses = _gauss_newton(edges, poses, root, weights)
         weights = _weights(edges, poses, root, width)
+    if not poses.matrix.isfinite().all():
+        raise ValueError(
+            "no poses follow from the edges, as nothing in common was found for some scans: leave out scans that show "
+            "too little, or give starting poses"
+        )
     return poses, weights
 
 
@@ -190,7 +171,9 @@ def _gauss_newton(edges: Edges, poses: RigidMotion, root: Tensor, weights: Tenso
     jacobian = csc_array(
         bsr_array((data, columns.reshape(-1).numpy(), np.arange(0, 2 * e + 1, 2)), shape=(e * k, scans * k))
     )[:, k:]  # the first pose is the anchor
-    step = spsolve(csc_array(jacobian.T @ jacobian), -jacobian.T @ residual.reshape(-1).numpy())
+    with warnings.catch_warnings():  # of a singular matrix: the poses are then NaN, and the caller says so
+        warnings.simplefilter("ignore", MatrixRankWarning)
+        step = spsolve(csc_array(jacobian.T @ jacobian), -jacobian.T @ residual.reshape(-1).numpy())
     moved = torch.cat((torch.zeros(k, dtype=torch.float64), torch.from_numpy(step))).reshape(scans, k)
     turns = k - poses.dimension
     turn = RigidMotion.from_rotvec(moved[:, :turns], moved[:, turns:])

@@ -16,6 +16,11 @@ FARTHEST_POINT, MOST_POINTS = 100.0, 0.75
 MOST_LOST = 0.5
 # So many scans are named in a sentence.
 NAMED = 5
+# Heights within this share of the farthest coordinate are one: what rounding to float32 leaves of it, several times.
+SAME_HEIGHT = 1e-6
+# Thickness, as a share of the length, below which the surface of a scan in space has no direction: normals are made of
+# it. Planar scans that are tilted and shaken by 1e-8 of their length are registered, by 1e-10 they are not.
+THINNEST = 1e-9
 
 
 def check_scan(name: str, scan: Float[np.ndarray, "n d"]) -> None:
@@ -41,8 +46,8 @@ def check_scan(name: str, scan: Float[np.ndarray, "n d"]) -> None:
 
 
 def without_far_points(
-    scans: list[Float[np.ndarray, "_ d"]], names: Sequence[str]
-) -> tuple[list[Float[np.ndarray, "_ d"]], list[str]]:
+    scans: list[Float[np.ndarray, "_ _"]], names: Sequence[str]
+) -> tuple[list[Float[np.ndarray, "_ _"]], list[str]]:
     """The scans without points that are too far to have been seen, and a sentence on them if there were any.
 
     Raises
@@ -67,3 +72,32 @@ def without_far_points(
         named[NAMED:] = [f"and others in {len(named) - NAMED} more scans"]
     kept = [scan[far <= limit] for scan, far in zip(scans, ranges, strict=True)]
     return kept, [f"points that lie {reason} were left out: {', '.join(named)}"]
+
+
+def without_height(scans: list[Float[np.ndarray, "_ _"]]) -> tuple[list[Float[np.ndarray, "_ _"]], list[str]]:
+    """The scans in the plane, ``(n, 2)``, if all points lie at one height, and a sentence on it unless that is 0."""
+    heights = np.concatenate([scan[:, 2] if scan.shape[1] == 3 else np.zeros(1) for scan in scans])
+    low, high = float(heights.min()), float(heights.max())
+    if high - low > SAME_HEIGHT * max(float(np.abs(scan[:, :2]).max()) for scan in scans):
+        return scans, []
+    flat = [np.ascontiguousarray(scan[:, :2]) for scan in scans]
+    return flat, [f"all points lie at z = {high:.6g}; they are mapped in the plane"] if low or high else []
+
+
+def check_depth(scans: Sequence[Float[np.ndarray, "_ 3"]]) -> None:
+    """Refuse scans in space that are all flat, as nothing then tells how they moved within their planes.
+
+    Raises
+    ------
+    ValueError: every scan is a piece of a plane.
+    """
+    if all(_is_flat(scan) for scan in scans):
+        raise ValueError(
+            "every scan is flat and its z varies, so in space nothing holds it in its plane: turn the scans so "
+            "that z is constant, and they are mapped in the plane"
+        )
+
+
+def _is_flat(scan: Float[np.ndarray, "n 3"]) -> bool:
+    lengths = np.linalg.svd(scan - scan.mean(axis=0), compute_uv=False)
+    return bool(lengths[-1] <= THINNEST * lengths[0])

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bbr_layer import read_cloud, read_poses, read_scans, scan_paths
-from train.scan_checks import check_scan, without_far_points
+from train.scan_checks import check_scan, without_far_points, without_height
 
 # Told a stage, how much of it is done, and of how much.
 Progress = Callable[[str, int, int], None]
@@ -94,8 +94,8 @@ def read_scan_set(
 ) -> ScanSet:
     """Read a folder of scans, several files, or one .npz of several scans.
 
-    Scans are planar (d = 2) when every z of every scan is 0 or missing. Points too far to have been seen are left out;
-    ``notes`` of the answer says so.
+    Scans are planar (d = 2) when every z of every scan is missing or the same. Points too far to have been seen are
+    left out. ``notes`` of the answer tells of both.
 
     Parameters
     ----------
@@ -112,16 +112,15 @@ def read_scan_set(
     if not sources or stride < 1:
         raise ValueError(f"{len(sources)} sources and stride {stride} were given; both must be at least 1")
     scans, names, total = _read_points(sources, stride, progress)
-    scans, notes = without_far_points(scans, names)
-    if all(scan.shape[1] == 2 or not scan[:, 2].any() for scan in scans):
-        scans = [np.ascontiguousarray(scan[:, :2]) for scan in scans]
+    scans, unseen = without_far_points(scans, names)
+    scans, dropped = without_height(scans)
     flat = scans[0].shape[1] == 2
     poses = {
         role: None if path is None else _read_trajectory(role, path, (total, stride), flat)
         for role, path in (("start", start), ("truth", truth))
     }
     timestamps = np.arange(total, dtype=np.float64)[::stride]
-    return ScanSet(scans, names, timestamps, start=poses["start"], truth=poses["truth"], notes=tuple(notes))
+    return ScanSet(scans, names, timestamps, start=poses["start"], truth=poses["truth"], notes=(*unseen, *dropped))
 
 
 def _read_points(sources: Sequence[Path], stride: int, progress: Progress) -> tuple[list[np.ndarray], list[str], int]:
