@@ -23,7 +23,7 @@ def turns(count):
 def folder(tmp_path, rng):
     """Twelve planar scans of rising size, named so that plain sorting would mix them up."""
     for number in range(12):
-        flat = np.column_stack((rng.uniform(1, 2, size=(number + 3, 2)), np.zeros(number + 3)))
+        flat = np.column_stack((rng.uniform(1, 2, size=(number + 10, 2)), np.zeros(number + 10)))
         write_cloud(tmp_path / f"scan{number}.ply", flat)
     return tmp_path
 
@@ -31,14 +31,14 @@ def folder(tmp_path, rng):
 def test_a_folder_is_read_in_natural_order_and_planar(folder):
     scans = read_scan_set([folder])
     assert scans.dimension == 2
-    assert [len(points) for points in scans.points] == list(range(3, 15))
+    assert [len(points) for points in scans.points] == list(range(10, 22))
     assert scans.names[10] == "scan10.ply"
     assert scans.timestamps.tolist() == list(range(12))
     assert scans.start is None and scans.truth is None
 
 
 def test_one_point_off_the_plane_makes_all_scans_3d(folder):
-    write_cloud(folder / "scan5.ply", np.array([[1.0, 1.0, 0.5], [1.0, 2.0, 0.0], [2.0, 1.0, 0.0]]))
+    write_cloud(folder / "scan5.ply", read_cloud(folder / "scan5.ply").points + 0.5 * np.eye(15, 3, -4))
     assert read_scan_set([folder]).dimension == 3
 
 
@@ -51,7 +51,7 @@ def test_scans_at_one_height_are_planar_and_their_height_is_told(folder):
 
 def test_a_point_too_far_to_have_been_seen_is_left_out_and_told(folder):
     points = read_scan_set([folder]).points
-    write_cloud(folder / "scan5.ply", np.column_stack((np.insert(points[5], 3, [65535, 0], axis=0), np.zeros(9))))
+    write_cloud(folder / "scan5.ply", np.column_stack((np.insert(points[5], 3, [65535, 0], axis=0), np.zeros(16))))
     scans = read_scan_set([folder])
     np.testing.assert_array_equal(scans.points[5], points[5])
     assert len(scans.notes) == 1 and "1 in scan5.ply" in scans.notes[0]
@@ -60,14 +60,14 @@ def test_a_point_too_far_to_have_been_seen_is_left_out_and_told(folder):
 def test_files_are_read_in_the_order_given(folder):
     scans = read_scan_set([folder / "scan7.ply", folder / "scan2.ply"])
     assert scans.names == ["scan7.ply", "scan2.ply"]
-    assert len(scans.points[0]) == 10
+    assert len(scans.points[0]) == 17
 
 
 def test_an_npz_of_several_scans(tmp_path, rng):
-    points, offsets = rng.normal(size=(9, 3)), np.array([0, 4, 9])
+    points, offsets = rng.normal(size=(25, 3)), np.array([0, 12, 25])
     np.savez(tmp_path / "all.npz", points=points, offsets=offsets)
     scans = read_scan_set([tmp_path / "all.npz"])
-    np.testing.assert_array_equal(scans.points[1], points[4:])
+    np.testing.assert_array_equal(scans.points[1], points[12:])
 
 
 @pytest.mark.parametrize("before_stride", [True, False])
@@ -111,21 +111,27 @@ def test_one_scan_is_no_map(folder):
         read_scan_set([folder], stride=12)
 
 
+SCAN = np.arange(1.0, 25.0).reshape(12, 2)
+BESIDE = np.array([[0.0, 0.0], [1.0, 2.0]])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"names": ["a"]}, "2 scans came with 1 names"),
-        ({"points": [np.zeros((3, 2)), np.zeros((3, 3))]}, "scan b has shape (3, 3)"),
-        ({"points": [np.ones((3, 2)), np.zeros((0, 2))]}, "scan b has 0 points"),
-        ({"points": [np.full((3, 2), np.nan), np.ones((3, 2))]}, "scan a is not finite"),
-        ({"points": [np.ones((1, 2)), np.ones((3, 2))]}, "scan a has 1 points; in 2D at least 2 are needed"),
-        ({"points": [np.ones((4, 3)), np.ones((2, 3))]}, "scan b has 2 points; in 3D at least 3 are needed"),
+        ({"points": [SCAN, SCAN.reshape(8, 3)]}, "scan b has shape (8, 3)"),
+        ({"points": [SCAN, np.zeros((0, 2))]}, "of the 0 points of scan b 0 are off its origin and differ"),
+        ({"points": [np.full((12, 2), np.nan), SCAN]}, "scan a is not finite"),
+        ({"points": [SCAN, SCAN[:9]]}, "of the 9 points of scan b 9 are off its origin and differ; a pose needs at"),
+        ({"points": [np.zeros((180, 2)), SCAN]}, "of the 180 points of scan a 0 are off its origin"),
+        ({"points": [SCAN, np.ones((180, 2))]}, "of the 180 points of scan b 1 are off its origin"),
+        ({"points": [SCAN, np.concatenate((np.tile(BESIDE, (90, 1)), SCAN[:9]))]}, "of the 189 points of scan b 9 are"),
         ({"truth": np.tile(np.eye(4), (2, 1, 1))}, "truth has shape (2, 4, 4)"),
         ({"start": np.tile(np.eye(3), (3, 1, 1))}, "start has shape (3, 3, 3)"),
     ],
 )
 def test_what_does_not_fit_is_named(as_a_user, change, words):
-    fields = {"points": [np.ones((3, 2)), np.ones((4, 2))], "names": ["a", "b"], "timestamps": np.arange(2.0)}
+    fields = {"points": [SCAN, SCAN + 1], "names": ["a", "b"], "timestamps": np.arange(2.0)}
     with pytest.raises(ValueError, match=re.escape(words)):
         ScanSet(**(fields | change))
 

@@ -26,7 +26,7 @@ class PreparedScan(NamedTuple):
     Parameters
     ----------
     points, normals: ``(n, d)`` float32, sensor frame, in the order of the file.
-    trained, held_out: rows to train on and rows to judge by; the same ones in scans of fewer than ``HELD_OUT``.
+    trained, held_out: rows to train on and rows to judge by.
     spacing: median distance between neighbours in a draw, in the data's unit.
     """
 
@@ -110,7 +110,7 @@ def prepare_scan(points: Float[np.ndarray, "n d"], most_points: int) -> Prepared
     """Estimate the normals, set the held-out rows apart, and measure the spacing of ``most_points`` of the others."""
     whole, rows = torch.from_numpy(points), np.arange(len(points))
     judged = rows % HELD_OUT == HELD_OUT // 2
-    trained, held_out = (rows[~judged], rows[judged]) if judged.any() else (rows, rows)
+    trained, held_out = rows[~judged], rows[judged]
     spacing = point_spacing(whole[trained[draw(len(trained), most_points, None)]])
     return PreparedScan(whole.float(), estimate_normals(whole).float(), trained, held_out, float(spacing))
 

@@ -5,6 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+# Different points off its origin that a scan must have. Measured with one scan of a simulated room thinned to so many:
+# from 10 on the map ends within 5 mm of the truth, with 5 it is 4 cm off, with 2 a quarter of a metre, with 3 lost.
+FEWEST_POINTS = 10
 # A scan that lies farther from its origin than this many times its own size was not seen from there. Measured on
 # simulated scans of a plane and of space, shifted: up to here their points end where unshifted ones do, at 40 000 times
 # a metre off, as float32 no longer resolves them. Scans of a sensor, or of an object before one, have at most 4.
@@ -28,13 +31,16 @@ def check_scan(name: str, scan: Float[np.ndarray, "n d"]) -> None:
 
     Raises
     ------
-    ValueError: NaN, fewer than d points, or a scan so far from its origin that no sensor was there.
+    ValueError: NaN, fewer than ``FEWEST_POINTS`` different points off the origin, or a scan so far from its origin
+        that no sensor was there.
     """
     if not np.isfinite(scan).all():
         raise ValueError(f"scan {name} is not finite; leave it out")
-    needed = scan.shape[1]
-    if len(scan) < needed:
-        raise ValueError(f"scan {name} has {len(scan)} points; in {needed}D at least {needed} are needed: leave it out")
+    if (few := _different_points(scan)) < FEWEST_POINTS:
+        raise ValueError(
+            f"of the {len(scan)} points of scan {name} {few} are off its origin and differ; a pose needs at least "
+            f"{FEWEST_POINTS}: leave it out"
+        )
     middle = np.median(scan, axis=0)
     away, size = np.linalg.norm(middle), np.median(np.linalg.norm(scan - middle, axis=1))
     if away > FARTHEST_ORIGIN * size > 0:
@@ -43,6 +49,15 @@ def check_scan(name: str, scan: Float[np.ndarray, "n d"]) -> None:
             "origin, as in coordinates of a country: subtract from each scan the place of its sensor, or one place "
             "among them from all"
         )
+
+
+def _different_points(scan: Float[np.ndarray, "n d"]) -> int:
+    """How many points off the origin, which no sensor sees, differ; counted up to ``FEWEST_POINTS``."""
+    rest, count = scan[scan.any(axis=1)], 0
+    while len(rest) and count < FEWEST_POINTS:
+        rest = rest[(rest != rest[0]).any(axis=1)]
+        count += 1
+    return count
 
 
 def without_far_points(

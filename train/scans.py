@@ -27,7 +27,8 @@ class ScanSet:
 
     Parameters
     ----------
-    points: k arrays ``(n_i, d)`` float64 in the data's unit, d = 2 or 3, each with at least d points.
+    points: k arrays ``(n_i, d)`` float64 in the data's unit, d = 2 or 3, each with at least
+        ``FEWEST_POINTS`` different ones off the origin.
     names: k names, for messages.
     timestamps: ``(k,)`` seconds, or the number of the scan.
     start: ``world_from_scan`` given by the user, ``(k, d + 1, d + 1)``; None: not known.
