@@ -1,6 +1,5 @@
 """Point clouds from files: one door for every format, and folders of scans in natural order."""
 
-import re
 import struct
 import tokenize
 import zipfile
@@ -17,6 +16,7 @@ from bbr_layer.atomic import existing_file
 from bbr_layer.cloud_columns import Columns, lengths
 from bbr_layer.cloud_formats import read_las, read_mesh, read_pcd, read_ply
 from bbr_layer.cloud_tables import read_bin, read_npy, read_npz, read_npz_sequence, read_text
+from bbr_layer.file_names import is_companion, natural_key
 
 # Formats made for points and meshes; a folder that holds any of them is read by them alone.
 CLOUD_READERS: dict[str, Callable[[Path], Columns]] = {
@@ -38,8 +38,7 @@ TABLE_READERS: dict[str, Callable[[Path], Columns]] = {
     ".csv": read_text,
 }
 READERS = CLOUD_READERS | TABLE_READERS
-NO_SCAN = re.compile(r"pose|calib|time|stamp|traj|odom|truth|gt|readme|label|t_", re.IGNORECASE)
-REASON_CHARACTERS = 200  # of a library's message; the rest is lists of what else it tried
+REASON_CHARACTERS = 200  # of a library's message or of file names; the rest is lists of more of the same
 KITTI_SCANS = "velodyne"  # the folder of scans inside a KITTI sequence
 # What the libraries raise at files that are damaged, locked or no such format: ImportError is trimesh's on
 # undecodable text, MemoryError and OverflowError come of absurd counts in a header, the last of archives.
@@ -126,18 +125,20 @@ def scan_paths(folder: str | Path) -> list[Path]:
 
     Raises
     ------
-    FileNotFoundError: there is no such folder, or no scan in it.
+    FileNotFoundError: there is no such folder, or no scan in it but by their names other tables.
     """
     found = Path(folder)
     if not found.is_dir():
         raise FileNotFoundError(f"{folder} is not a folder: check the name, and the folder it is seen from")
-    files = sorted((file for file in found.iterdir() if _visible_file(file)), key=_natural)
-    tables = [file for file in files if file.suffix.lower() in TABLE_READERS and not NO_SCAN.match(file.name)]
+    files = sorted((file for file in found.iterdir() if _visible_file(file)), key=natural_key)
+    tables = [file for file in files if file.suffix.lower() in TABLE_READERS and not is_companion(file)]
     scans = [file for file in files if file.suffix.lower() in CLOUD_READERS] or tables
     if not scans and (found / KITTI_SCANS).is_dir():
         return scan_paths(found / KITTI_SCANS)
     if not scans:
-        raise FileNotFoundError(f"{folder} holds no scans; files ending {' '.join(READERS)} are wanted")
+        others = ", ".join(file.name for file in files if file.suffix.lower() in TABLE_READERS)
+        named = f"; by their names {others[:REASON_CHARACTERS]} are none: name such files one by one" if others else ""
+        raise FileNotFoundError(f"{folder} holds no scans; files ending {' '.join(READERS)} are wanted{named}")
     return scans
 
 
@@ -185,8 +186,3 @@ def _reason(error: BaseException) -> str:
 
 def _visible_file(path: Path) -> bool:
     return path.is_file() and not path.name.startswith(".")
-
-
-def _natural(path: Path) -> list[tuple[int, int | str]]:
-    parts = re.split(r"(\d+)", path.name.lower())
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]

@@ -61,7 +61,7 @@ ORDER = {
         buddies_loss fit_score
         starts
         layer
-        atomic cloud_columns
+        atomic cloud_columns file_names
         cloud_tables cloud_formats cloud_writing trajectories
         clouds
         functional verdict

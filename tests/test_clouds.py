@@ -110,8 +110,35 @@ def test_scans_come_in_natural_order_without_their_companions(tmp_path, points):
     assert len(read_scans([tmp_path / "b.ply", tmp_path / "scan1.csv"])) == 2
 
 
+BESIDE_SCANS = (
+    *("groundtruth.txt", "ground_truth.csv", "GT.txt", "poses_tum.txt", "left_poses.csv", "frame-000000.pose.txt"),
+    *("pose_01.txt", "times.txt", "timestamps_left.txt", "scan_stamps.csv", "calib_cam_to_velo.txt", "traj.txt"),
+    *("stamped_traj_estimate.txt", "odometry.csv", "01_labels.npy", "README.txt", "time.txt"),
+)
+CALLED_SO = (
+    *("t_000.csv", "time_000.csv", "gtsam_0.csv", "truck_0.csv", "v1_pose0.csv", "compose1.csv", "posed.csv"),
+    *("timestamp_1305031102.csv", "stampede.csv", "labelled_1.csv", "tracks.csv"),
+)
+
+
+@pytest.mark.parametrize("name", BESIDE_SCANS)
+def test_what_lies_beside_scans_is_no_scan(tmp_path, name):
+    for file in ("scan0.csv", "scan1.csv", name):
+        (tmp_path / file).write_text("1 2 3\n4 5 6\n")
+    assert [path.name for path in scan_paths(tmp_path)] == ["scan0.csv", "scan1.csv"]
+
+
+@pytest.mark.parametrize("name", CALLED_SO)
+def test_scans_may_be_called_nearly_so(tmp_path, name):
+    (tmp_path / name).write_text("1 2 3\n4 5 6\n")
+    assert [path.name for path in scan_paths(tmp_path)] == [name]
+
+
 def test_folders_without_scans(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no scans; files ending .ply"):
+        scan_paths(tmp_path)
+    (tmp_path / "pose_0.csv").write_text("1 2 3\n")
+    with pytest.raises(FileNotFoundError, match=r"by their names pose_0.csv are none: name such files"):
         scan_paths(tmp_path)
     with pytest.raises(FileNotFoundError, match="not a folder"):
         read_scans(tmp_path / "nowhere")

@@ -30,7 +30,7 @@ def test_points_too_far_to_have_been_seen_go_and_are_told(rng):
     for number, room in enumerate(rooms):
         assert np.array_equal(kept[number], room if number != 1 else np.delete(room, 5, axis=0))
     assert len(notes) == 1 and notes[0].startswith("points that lie farther than 2")
-    assert "1 in 0.csv, 2 in 1.csv, 1 in 2.csv, 1 in 4.csv, 1 in 5.csv, and others in 2 more scans" in notes[0]
+    assert notes[0].endswith("1 in 0.csv, 2 in 1.csv, 1 in 2.csv, 1 in 4.csv, 1 in 5.csv and 2 more")
 
 
 def test_scans_without_such_points_stay_as_they_are():

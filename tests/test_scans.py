@@ -57,6 +57,15 @@ def test_a_point_too_far_to_have_been_seen_is_left_out_and_told(folder):
     assert len(scans.notes) == 1 and "1 in scan5.ply" in scans.notes[0]
 
 
+def test_files_that_are_called_like_something_else_are_told(tmp_path, rng):
+    for name in ("s0.csv", "s1.csv", "groundtruth.csv", "times.csv", ".hidden.csv", "times.txt"):
+        np.savetxt(tmp_path / name, rng.normal(size=(20, 3)), delimiter=",")
+    scans = read_scan_set([tmp_path])
+    assert scans.names == ["s0.csv", "s1.csv"]
+    assert scans.notes == ("not taken for scans, for their names: groundtruth.csv, times.csv",)
+    assert read_scan_set([tmp_path / "s0.csv", tmp_path / "times.csv"]).notes == ()
+
+
 def test_files_are_read_in_the_order_given(folder):
     scans = read_scan_set([folder / "scan7.ply", folder / "scan2.ply"])
     assert scans.names == ["scan7.ply", "scan2.ply"]

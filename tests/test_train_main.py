@@ -162,6 +162,17 @@ def test_bad_input_is_told_and_nothing_is_written(wrong, world, arguments, words
     assert not (wrong / "out").exists()
 
 
+@pytest.mark.parametrize("command", ["map", "fit"])
+def test_the_folder_of_the_scans_is_no_output(world, tmp_path, command):
+    poses = ("--poses", world / "truth_tum.txt") if command == "fit" else ()
+    before = sorted(world.iterdir())
+    assert "where map.ply would be read as a scan" in refused(command, world, *poses, "--out", world / ".")
+    assert sorted(world.iterdir()) == before
+    shutil.copytree(world, tmp_path / "kitti" / "velodyne")
+    sentence = refused(command, tmp_path / "kitti", *poses, "--out", tmp_path / "kitti" / "velodyne")
+    assert "the folder of the scans" in sentence
+
+
 @pytest.mark.parametrize("command", ["map", "simulate"])
 def test_an_output_that_cannot_be_written(wrong, world, command):
     out = wrong / "file" / "out"

@@ -16,7 +16,7 @@ from train.device import check_device
 from train.evaluate import evaluate_trajectory
 from train.known_edges import KnownEdges
 from train.mapping import map_scans
-from train.run_folder import open_run
+from train.run_folder import check_apart, open_run
 from train.scans import ScanSet, planar_poses, read_scan_set
 from train.simulate import DEFAULTS, SimulatedScans, simulate
 from train.simulation_files import TRUTH_FILE, write_simulation
@@ -78,6 +78,7 @@ def map_command(
         check_device(settings.device)
         with shown_progress(console) as progress:
             if scans:
+                check_apart(out, scans)
                 given = read_scan_set(scans, start=start, truth=truth, stride=settings.stride, progress=progress)
                 run = open_run(out, given, settings, resume=resume, overwrite=overwrite)
             else:
@@ -117,6 +118,7 @@ def fit(
         check_device(settings.device)
         if edges is None and settings.training.term == "residual":
             raise ValueError("term residual compares poses with registered edges: give --edges, or another term")
+        check_apart(out, scans)
         with shown_progress(console) as progress:
             given = read_scan_set(scans, start=poses, truth=truth, stride=settings.stride, progress=progress)
             known = KnownEdges(edges)

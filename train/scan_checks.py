@@ -17,7 +17,7 @@ FARTHEST_ORIGIN = 1000.0
 FARTHEST_POINT, MOST_POINTS = 100.0, 0.75
 # Of a scan that would lose more than this share, not its points but its frame or its unit is wrong.
 MOST_LOST = 0.5
-# So many scans are named in a sentence.
+# So many scans or files are named in a sentence.
 NAMED = 5
 # Heights within this share of the farthest coordinate are one: what rounding to float32 leaves of it, several times.
 SAME_HEIGHT = 1e-6
@@ -82,11 +82,19 @@ def without_far_points(
             raise ValueError(f"{whole}: leave it out, or give it in its sensor's frame and the unit of the others")
     if not lost:
         return scans, []
-    named = [f"{count} in {names[number]}" for number, count in lost.items()]
-    if len(named) > NAMED:
-        named[NAMED:] = [f"and others in {len(named) - NAMED} more scans"]
+    named = listed([f"{count} in {names[number]}" for number, count in lost.items()])
     kept = [scan[far <= limit] for scan, far in zip(scans, ranges, strict=True)]
-    return kept, [f"points that lie {reason} were left out: {', '.join(named)}"]
+    return kept, [f"points that lie {reason} were left out: {named}"]
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first few of many in words.
+
+    >>> listed(["a", "b", "c", "d", "e", "f", "g"])
+    'a, b, c, d, e and 2 more'
+    """
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def without_height(scans: list[Float[np.ndarray, "_ _"]]) -> tuple[list[Float[np.ndarray, "_ _"]], list[str]]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bbr_layer import read_cloud, read_poses, read_scans, scan_paths
-from train.scan_checks import check_scan, without_far_points, without_height
+from train.scan_checks import check_scan, listed, without_far_points, without_height
 
 # Told a stage, how much of it is done, and of how much.
 Progress = Callable[[str, int, int], None]
@@ -96,7 +96,7 @@ def read_scan_set(
     """Read a folder of scans, several files, or one .npz of several scans.
 
     Scans are planar (d = 2) when every z of every scan is missing or the same. Points too far to have been seen are
-    left out. ``notes`` of the answer tells of both.
+    left out. ``notes`` of the answer tells of both, and of files in the folder that are called like something else.
 
     Parameters
     ----------
@@ -121,7 +121,8 @@ def read_scan_set(
         for role, path in (("start", start), ("truth", truth))
     }
     timestamps = np.arange(total, dtype=np.float64)[::stride]
-    return ScanSet(scans, names, timestamps, start=poses["start"], truth=poses["truth"], notes=(*unseen, *dropped))
+    notes = (*_passed_over(sources), *unseen, *dropped)
+    return ScanSet(scans, names, timestamps, start=poses["start"], truth=poses["truth"], notes=notes)
 
 
 def _read_points(sources: Sequence[Path], stride: int, progress: Progress) -> tuple[list[np.ndarray], list[str], int]:
@@ -137,6 +138,17 @@ def _read_points(sources: Sequence[Path], stride: int, progress: Progress) -> tu
         scans.append(read_cloud(path).points)
         progress("reading", number + 1, len(kept))
     return scans, [path.name for path in kept], len(paths)
+
+
+def _passed_over(sources: Sequence[Path]) -> list[str]:
+    """A sentence on the files in a folder of scans that end like them but are called like something else."""
+    if len(sources) != 1 or not sources[0].is_dir():
+        return []
+    read = scan_paths(sources[0])
+    kinds = {path.suffix.lower() for path in read}
+    beside = {path for path in read[0].parent.iterdir() if path.suffix.lower() in kinds and path.is_file()} - set(read)
+    others = sorted(path.name for path in beside if not path.name.startswith("."))
+    return [f"not taken for scans, for their names: {listed(others)}"] if others else []
 
 
 def _read_trajectory(role: str, path: Path, scans: tuple[int, int], flat: bool) -> np.ndarray:
