@@ -28,4 +28,5 @@ def natural_key(path: Path) -> list[tuple[int, int | str]]:
     ['scan9.ply', 'scan10.ply']
     """
     parts = re.split(r"(\d+)", path.name.lower())
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]
+    # Not isdigit, which calls a circled or raised number a digit too, and int reads neither.
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]

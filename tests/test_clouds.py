@@ -134,6 +134,12 @@ def test_scans_may_be_called_nearly_so(tmp_path, name):
     assert [path.name for path in scan_paths(tmp_path)] == [name]
 
 
+def test_a_number_in_a_circle_is_no_number(tmp_path):
+    for name in ("①2.csv", "①10.csv", "²1.csv"):
+        (tmp_path / name).write_text("1 2 3\n4 5 6\n")
+    assert {path.name for path in scan_paths(tmp_path)} == {"²1.csv", "①2.csv", "①10.csv"}
+
+
 def test_folders_without_scans(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no scans; files ending .ply"):
         scan_paths(tmp_path)
