@@ -4,28 +4,43 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from bbr_layer.cloud_columns import Columns, are_unit, chosen_names, columns_by_count, columns_by_name, real_numbers
 
 BIN_BYTES = 4  # float32, the KITTI velodyne layout
+RINGS = 256  # more than the lasers of any lidar; the number of the laser is the fifth column of nuScenes
 POINT_KEYS = ("points", "P", "xyz")  # what an .npz calls its points, the first one found
 COMMENTS = ("#", "//")  # before the first row; after it only "#"
 
 
 def read_bin(path: Path) -> Columns:
-    """Float32 rows: x y z reflectance (KITTI), or x y z nx ny nz where the last three have unit length.
+    """Float32 rows: x y z reflectance (KITTI), x y z nx ny nz where the last three have unit length, or x y z intensity
+    ring (nuScenes) where the fifth column holds small whole numbers and the first three do not.
 
     Raises
     ------
-    ValueError: the size is that of neither, as of a file cut short.
+    ValueError: the size is that of none, as of a file cut short.
     """
     values = np.fromfile(path, dtype="<f4")
     size = path.stat().st_size
     if size % (6 * BIN_BYTES) == 0 and size and are_unit(values.reshape(-1, 6)[:, 3:]):
         return columns_by_count(values.reshape(-1, 6))
+    if size % (5 * BIN_BYTES) == 0 and size and _have_rings(values.reshape(-1, 5)):
+        return columns_by_count(values.reshape(-1, 5))
     if size % (4 * BIN_BYTES) == 0:
         return columns_by_count(values.reshape(-1, 4))
-    raise ValueError(f"its {size} bytes are no whole rows of 4 float32 (x y z reflectance), nor of 6 with unit normals")
+    raise ValueError(
+        f"its {size} bytes are no whole rows of 4 float32 (x y z reflectance), nor of 5 with the number of a laser, "
+        "nor of 6 with unit normals"
+    )
+
+
+def _have_rings(table: Float[np.ndarray, "n 5"]) -> bool:
+    """Does the fifth column number the lasers? In rows of another length it would hold coordinates, too."""
+    rings = table[:, 4]
+    whole = table == np.floor(table)
+    return bool(whole[:, 4].all() and (rings >= 0).all() and (rings < RINGS).all() and not whole[:, :3].all())
 
 
 def read_npy(path: Path) -> Columns:

@@ -76,7 +76,7 @@ class Cloud:
 def read_cloud(path: str | Path) -> Cloud:
     """Read one point cloud, its format chosen by its suffix.
 
-    .ply .pcd .bin (KITTI) .las .laz .npz .npy .xyz .txt .csv, and the vertices of .obj .stl .off (see
+    .ply .pcd .bin (KITTI, nuScenes) .las .laz .npz .npy .xyz .txt .csv, and the vertices of .obj .stl .off (see
     ``sample_surface`` for points on the faces). Tables of two columns, and those without z, give a 2D cloud.
 
     Raises

@@ -92,6 +92,21 @@ def test_npz_keys(tmp_path, points, normals, key):
     np.testing.assert_allclose(cloud.normals, normals)
 
 
+@pytest.mark.parametrize("count", [6, 8])  # rows of 5 alone, and rows of 4 as well
+def test_bin_of_nuscenes_has_the_number_of_the_laser(tmp_path, rng, count):
+    rows = np.column_stack((rng.normal(size=(count, 3)), rng.integers(0, 255, count), np.arange(count))).astype("<f4")
+    rows.tofile(tmp_path / "a.pcd.bin")
+    cloud = read_cloud(tmp_path / "a.pcd.bin")
+    np.testing.assert_array_equal(cloud.points, rows[:, :3])
+    np.testing.assert_array_equal(cloud.intensity, rows[:, 3])
+
+
+def test_bin_of_whole_numbers_and_of_a_multiple_of_five_points_is_kitti(tmp_path, rng):
+    for rows in (np.arange(40.0).reshape(10, 4), rng.normal(size=(10, 4))):
+        rows.astype("<f4").tofile(tmp_path / "a.bin")
+        np.testing.assert_array_equal(read_cloud(tmp_path / "a.bin").points, rows[:, :3].astype("<f4"))
+
+
 def test_four_columns_where_the_bytes_would_fit_six(tmp_path, rng):
     rows = rng.normal(size=(12, 4)).astype(np.float32)  # 192 bytes: 12 rows of four or 8 of six
     rows.tofile(tmp_path / "a.bin")
