@@ -105,7 +105,8 @@ def test_autocast_changes_nothing(layer):
 
 
 def _learning():
-    layer = BBRLayer("softBD", inner=Adam(5, nn.Parameter(torch.tensor(0.05, dtype=torch.float64))), temperature=Learned(1.0))
+    rate = nn.Parameter(torch.tensor(0.05, dtype=torch.float64))
+    layer = BBRLayer("softBD", inner=Adam(5, rate), temperature=Learned(1.0))
     return layer, dict(layer.named_parameters())
 
 
