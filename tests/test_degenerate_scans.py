@@ -30,10 +30,11 @@ def test_a_sensor_that_stands_still_to_the_last_bit_and_then_moves_is_mapped():
     np.testing.assert_allclose(poses[:, :2, 2], places, atol=0.02)
 
 
-def test_flat_scans_in_space_are_refused_as_nothing_holds_them_in_their_planes():
+@pytest.mark.parametrize("stored", [np.float64, np.float32])
+def test_flat_scans_in_space_are_refused_as_nothing_holds_them_in_their_planes(stored):
     tilted = [np.column_stack((room, 0.05 * room[:, 0] + 0.3)) for room in map(square_room, 0.1 * np.eye(3)[:, :2])]
     with pytest.raises(ValueError, match=r"every scan is flat .* and they are mapped in the plane"):
-        registered(tilted)
+        registered([scan.astype(stored).astype(np.float64) for scan in tilted])
 
 
 def test_edges_that_say_nothing_of_a_pose_are_refused_in_a_sentence():
