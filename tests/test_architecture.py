@@ -88,10 +88,11 @@ ORDER = {
         map_entropy occupancy_grid poses
         evaluate drawing ros_map
         curves pictures browser_map
-        config scan_checks device damage
+        config scan_checks damage
         scans
         prepared pose_graph consensus
         surfaces edge_files report run_folder checkpoints spanning_tree
+        beforehand
         shape_features refinement
         free_space_evidence planes
         scene moving_points

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from bbr_layer import read_cloud, read_poses, write_cloud, write_poses_tum
 from train.__main__ import app
+from train.beforehand import PRESENT
 from train.config import load_config
 from train.console import _kept_sentence
-from train.device import PRESENT
 
 FAST = ("--epochs", "2")
 
@@ -171,6 +171,16 @@ def test_the_folder_of_the_scans_is_no_output(world, tmp_path, command):
     shutil.copytree(world, tmp_path / "kitti" / "velodyne")
     sentence = refused(command, tmp_path / "kitti", *poses, "--out", tmp_path / "kitti" / "velodyne")
     assert "the folder of the scans" in sentence
+
+
+@pytest.mark.parametrize(("option", "name"), [("--edges", "edges.npz"), ("--poses", "poses_tum.txt")])
+def test_what_a_run_is_given_does_not_lie_where_it_would_be_replaced(world, tmp_path, option, name):
+    given = {"--poses": world / "truth_tum.txt", option: tmp_path / name}
+    shutil.copy(world / "truth_tum.txt", tmp_path / name)
+    arguments = [x for pair in given.items() for x in pair]
+    sentence = refused("fit", world, *arguments, "--out", tmp_path / ".", "--overwrite")
+    assert f"{name} is a part of the run in" in sentence and "give another folder as out" in sentence
+    assert [x.name for x in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.parametrize("command", ["map", "simulate"])

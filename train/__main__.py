@@ -10,13 +10,13 @@ import typer
 from rich.console import Console
 
 from bbr_layer import read_poses
+from train.beforehand import check_beforehand
 from train.config import TERMS, load_config
 from train.console import PrintedUnit, one_sentence, show_map, show_metrics, shown_progress
-from train.device import check_device
 from train.evaluate import evaluate_trajectory
 from train.known_edges import KnownEdges
 from train.mapping import map_scans
-from train.run_folder import check_apart, open_run
+from train.run_folder import open_run
 from train.scans import ScanSet, planar_poses, read_scan_set
 from train.simulate import DEFAULTS, SimulatedScans, simulate
 from train.simulation_files import TRUTH_FILE, write_simulation
@@ -75,10 +75,9 @@ def map_command(
     console, printed = Console(), PrintedUnit(unit_scale, unit if scans or unit else SIMULATED_UNIT)
     with one_sentence():
         settings = load_config(config, changes(term=term, epochs=epochs, stride=stride, seed=seed, device=device))
-        check_device(settings.device)
+        check_beforehand(settings, out, scans or [], (start, truth))
         with shown_progress(console) as progress:
             if scans:
-                check_apart(out, scans)
                 given = read_scan_set(scans, start=start, truth=truth, stride=settings.stride, progress=progress)
                 run = open_run(out, given, settings, resume=resume, overwrite=overwrite)
             else:
@@ -115,10 +114,9 @@ def fit(
     console, printed = Console(), PrintedUnit(unit_scale, unit)
     with one_sentence():
         settings = load_config(config, changes(term=term, epochs=epochs, stride=stride, seed=seed, device=device))
-        check_device(settings.device)
+        check_beforehand(settings, out, scans, (poses, edges, truth))
         if edges is None and settings.training.term == "residual":
             raise ValueError("term residual compares poses with registered edges: give --edges, or another term")
-        check_apart(out, scans)
         with shown_progress(console) as progress:
             given = read_scan_set(scans, start=poses, truth=truth, stride=settings.stride, progress=progress)
             known = KnownEdges(edges)

@@ -2,11 +2,10 @@
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bbr_layer import atomic_write, scan_paths
+from bbr_layer import atomic_write
 from train.config import MapConfig
 from train.scans import ScanSet
 
@@ -40,23 +39,6 @@ class RunFolder:
     path: Path
     registered: bool
     begun: bool
-
-
-def check_apart(path: Path, sources: Sequence[Path]) -> None:
-    """Refuse the folder of the scans as the folder of a run: its ``map.ply`` would be a scan of the next run.
-
-    Raises
-    ------
-    ValueError: the scans are read from ``path``.
-    FileNotFoundError: a folder among the sources holds no scans.
-    """
-    folders = [folder for folder in sources if folder.is_dir()]
-    read = {folder.resolve() for folder in folders} | {scan_paths(folder)[0].parent.resolve() for folder in folders}
-    if path.resolve() in read:
-        raise ValueError(
-            f"out is {path}, the folder of the scans, where map.ply would be read as a scan the next time: give "
-            "another folder"
-        )
 
 
 def open_run(
