@@ -84,7 +84,9 @@ def test_masked_points_are_not_there_and_batches_are_items(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_no_pairs_by_pairs_are_kept_for_the_gradient(name):
     P, Q = bumpy(90, 3).requires_grad_(), bumpy(80, 3)
-    normals = {"P_normals": bumpy(90, 3), "Q_normals": bumpy(80, 3)}
+    normals = {
+        f"{side}_normals": torch.nn.functional.normalize(bumpy(n, 3), dim=-1) for side, n in (("P", 90), ("Q", 80))
+    }
     sizes = []
     with torch.autograd.graph.saved_tensors_hooks(lambda x: sizes.append(x.numel()) or x, lambda x: x):
         BestBuddiesLoss(name)(P, Q, **normals)

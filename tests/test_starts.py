@@ -168,7 +168,8 @@ def test_scans_of_which_a_wrong_start_finds_nearly_as_many_buddies(seed, real_da
 def test_features_keep_the_gradient_that_soft_buddies_give_them():
     P, Q, _ = _turned(3, 20, 0)
     features = P.clone().requires_grad_()
-    result = BBRLayer.robust()(P, Q, P_features=features, Q_features=P)
+    with pytest.warns(UserWarning, match="features want a gradient"):
+        result = BBRLayer.robust()(P, Q, P_features=features, Q_features=P)
     (gradient,) = torch.autograd.grad(result.target_from_source.translation.sum(), features)
     assert gradient.abs().max() > 0
 

@@ -134,5 +134,5 @@ def test_settings_of_a_stage_that_cannot_work_are_refused(as_a_user):
         BBRLayer(Stage(BuddyFilter(), dimension=2), Stage(BuddyFilter(), above=10, dimension=3))
     with pytest.raises(ValueError, match="dimension is 4; a stage is for clouds in 2 or 3 dimensions"):
         Stage(BuddyFilter(), dimension=4)
-    with pytest.raises(ValueError, match="P is in 2D, and no stage of the layer is for such"):
+    with pytest.raises(ValueError, match="no stage of the layer is for 2D clouds of up to 9 points"):
         BBRLayer(Stage(BuddyFilter(), dimension=3))(torch.rand(9, 2), torch.rand(9, 2))
