@@ -40,6 +40,12 @@ class Preset(StrEnum):
     ROBUST = "robust"
 
 
+Starts = Annotated[int | None, typer.Option(help="Starting rotations tried. Default 1; robust, and in the plane, 7.")]
+SoftPoints = Annotated[
+    int, typer.Option(help="Most points of each cloud in the soft stage; fast: at most 300; not with --loss F.")
+]
+
+
 @app.callback()
 def main() -> None:
     """Best Buddies Registration of point clouds."""
@@ -55,8 +61,8 @@ def register(
     out: Annotated[Path | None, typer.Option(help="Write the moved source here: .ply .pcd .npz .csv .xyz")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Answer in JSON and nothing else.")] = False,
     start: Annotated[Path | None, typer.Option(help="A text file: the 4 x 4 target_from_source to begin with.")] = None,
-    starts: Annotated[int | None, typer.Option(help="Starting rotations tried; robust: 7.")] = None,
-    points: Annotated[int, typer.Option(help="Most points of each cloud in the soft stage.")] = SOFT_POINTS,
+    starts: Starts = None,
+    points: SoftPoints = SOFT_POINTS,
 ) -> None:
     """Find the motion that carries SOURCE onto TARGET, and say how far to trust it."""
     try:

@@ -191,7 +191,7 @@ class BBRLayer(nn.Module):
         settings = [*map(repr, self.stages), f"backward={self.backward_mode!r}"]
         settings += [] if self.starts in (None, 1) else [f"starts={self.starts}"]
         many = len(self.stages) > 1
-        return "\n  ".join(["BBRLayer(", *settings]) + "\n)" if many else f"BBRLayer({', '.join(settings)})"
+        return "BBRLayer(\n  " + ",\n  ".join(settings) + "\n)" if many else f"BBRLayer({', '.join(settings)})"
 
 
 def _device_type(points: Tensor) -> str:

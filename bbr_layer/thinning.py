@@ -24,7 +24,13 @@ def evenly_thinned(points: Float[np.ndarray, "n d"], most: int) -> Int[np.ndarra
     ----------
     points: ``(n, d)``, finite.
     most: at least 1.
+
+    Raises
+    ------
+    ValueError: ``most`` is less.
     """
+    if most < 1:
+        raise ValueError(f"most is {most}; at least one point must be left: try 1000")
     if len(points) <= most:
         return np.arange(len(points))
     kept = np.zeros(1, dtype=np.int64)  # all in one cell, should every grid that is tried leave too many

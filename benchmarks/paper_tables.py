@@ -29,8 +29,8 @@ what the paper leaves open.
   The lowest median of all but the paper's variants is bold. **s** is processor seconds per registration in the last
   column's trials, normals and trees included where the method makes them.
 - **Repeats**: {repeats} per cell, {twice} in Figs. 6 and 7, {half} per lidar pair. The paper's own variants,
-  `BBRLayer.paper(...)`, take seconds each and have at most {variants}, in some places, shared sampling only, at most
-  500 points; their brackets say how many.
+  `BBRLayer.paper(...)`, take seconds each: at most {variants} repeats, in some experiments only, with shared sampling
+  and at most 500 points; their brackets say how many.
 - **Ours**: `BBRLayer()`, `BBRLayer.fast()` and `BBRLayer.robust()` without any argument; on lidar also
   `BBRLayer("F")`, the paper's loss alone. Lidar scans are thinned to {all} points as in the paper, for FPFH + RANSAC
   to {features}.

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import sys
 
 import numpy as np
 import pytest
@@ -139,6 +140,8 @@ def test_copies_pickles_and_says_what_it_is():
     plain = layer(given["P"], given["Q"])
     for other in (copy.deepcopy(layer), pickle.loads(pickle.dumps(layer))):
         _same(other(given["P"], given["Q"]), plain)
+    for shown in (layer, BBRLayer(), BBRLayer.fast(), BBRLayer.paper("N"), BBRLayer("F", backward=Truncated(3))):
+        assert repr(eval(repr(shown), vars(sys.modules["bbr_layer"]).copy())) == repr(shown)
     assert "SoftBD(smoothing=0.2" in repr(layer) and "Truncated(last_steps=3)" in repr(layer)
 
 

@@ -31,6 +31,11 @@ def test_no_more_than_asked_for_and_not_many_fewer(rng, most):
     assert (np.diff(kept) > 0).all()
 
 
+def test_at_least_one_point_is_left(as_a_user):
+    with pytest.raises(ValueError, match="most is 0; at least one point must be left: try 1000"):
+        evenly_thinned(np.zeros((5, 3)), 0)
+
+
 def test_dense_places_are_thinned_most(rng):
     points = np.concatenate((rng.random((2000, 2)), 0.01 * rng.random((2000, 2)) + 5))
     kept = evenly_thinned(points, 300)

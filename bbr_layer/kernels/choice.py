@@ -45,8 +45,9 @@ TORCH = Sweeps("torch", reference.soft_gradient, reference.soft_directional, lam
 def backend(device: torch.device | str = "cpu") -> Backend:
     """What computes on ``device``, and why; the environment variable ``BBR_BACKEND`` overrides the choice.
 
-    Matching by features, clipping (on a GPU, or with padded points) and an epsilon too small for exponentials that may
-    underflow (``supports`` of each backend) are computed by torch whatever the backend.
+    Matching by features (on a GPU, or between more than 2^25 pairs of points), clipping (on a GPU, or with padded
+    points) and an epsilon too small for exponentials that may underflow (``supports`` of each backend) are computed by
+    torch whatever the backend.
 
     Raises
     ------

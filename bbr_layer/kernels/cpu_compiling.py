@@ -9,6 +9,10 @@ from typing import Any
 from numba import njit
 from numba.core.event import Event, Listener, register
 
+MESSAGE = (
+    "bbr_layer is being compiled for this processor, a minute or two the first time: what is kept on disk is not "
+    "compiled again"
+)
 LOGGER = logging.getLogger("bbr_layer")
 # Reassociation lets sums run in vector registers; infinities and NaN never enter, inputs are checked at the door.
 FAST = {"nnan", "ninf", "nsz", "contract", "arcp", "reassoc", "afn"}
@@ -52,7 +56,7 @@ class Told(Listener):
     def on_start(self, event: Event) -> None:
         if not self.told and event.data["dispatcher"].py_func.__module__.startswith("bbr_layer."):
             self.told = True
-            LOGGER.warning("bbr_layer is being compiled for this processor, once: up to a minute before it starts")
+            LOGGER.warning(MESSAGE)
 
     def on_end(self, event: Event) -> None:
         pass
