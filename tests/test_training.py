@@ -60,9 +60,19 @@ def test_a_killed_training_goes_on_to_the_same_bits(tmp_path, epoch, adjust):
     assert [len(curve) for curve in whole.curves.values()] == [6, 5, 5, 5, 5]
 
 
+@pytest.fixture
+def own_interrupt():
+    """Ctrl-C as Python has it: a process that a shell started in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.parametrize("epoch", [2, 3])
-def test_a_training_that_a_signal_stops_says_so_and_goes_on_to_the_same_bits(tmp_path, number, code, epoch):
+def test_a_training_that_a_signal_stops_says_so_and_goes_on_to_the_same_bits(
+    tmp_path, number, code, epoch, own_interrupt
+):
     scans = small_world()
     problem = scans, true_edges(scans), displaced(true_poses(scans), 0.1), small_config(epochs=3, points=20)
     handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
