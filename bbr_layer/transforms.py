@@ -67,7 +67,7 @@ def _called(how: Settled, tensors: tuple[Tensor | None, ...]) -> tuple[Tensor, .
 
 @contextmanager
 def _put(places: list[Place], values: Sequence[Tensor | None]) -> Iterator[None]:
-    """Other tensors in these places, for a while."""
+    """Other tensors in these places, for a while: as with ``functional_call``, one thread at a time."""
     before = settings_of(places)
     try:
         _set(places, values)
