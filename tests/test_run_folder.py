@@ -10,6 +10,10 @@ from train.checkpoints import LAST
 from train.run_folder import EDGES, MAP_FILES, open_run
 
 
+class Killed(Exception):
+    """Stands for the end of the process."""
+
+
 @pytest.fixture
 def opened(tmp_path):
     """Opens one folder, with files in it as a finished run leaves them."""
