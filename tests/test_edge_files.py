@@ -32,7 +32,8 @@ def test_edges_of_other_scans_are_refused(tmp_path):
     with pytest.raises(ValueError, match="belongs to 8 scans in 2D; 7 in 2D were given"):
         load_edges(path, fewer)
     with pytest.raises(ValueError, match="belongs to other scans, as many as were given"):
-        load_edges(path, dataclasses.replace(scans, points=scans.points[::-1]))
+        found, _ = load_edges(path, dataclasses.replace(scans, points=scans.points[::-1]))
+    assert torch.equal(found.target_from_source.matrix, true_edges(scans).target_from_source.matrix)
     load_edges(path, with_start(scans, true_poses(scans)))
 
 
@@ -42,7 +43,8 @@ def test_a_file_that_does_not_tell_whose_edges_it_holds_is_believed(tmp_path):
     with np.load(path) as arrays:
         older = {name: arrays[name] for name in arrays if name != "scans"}
     np.savez(path, **older)
-    load_edges(path, dataclasses.replace(scans, points=scans.points[::-1]))
+    found, _ = load_edges(path, dataclasses.replace(scans, points=scans.points[::-1]))
+    assert torch.equal(found.target_from_source.matrix, true_edges(scans).target_from_source.matrix)
 
 
 def test_what_is_no_file_of_edges(tmp_path):
