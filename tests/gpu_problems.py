@@ -94,7 +94,7 @@ def error(name: str, precision: str, device: str) -> float:
     problem, dtype = PROBLEMS[name], getattr(torch, precision)
     scene, direction = (cast(x, dtype, device) for x in scene_of(problem))
     exact, along = (cast(x, torch.float64, "cpu") for x in (scene, direction))
-    assert gpu.supports(problem.terms, scene)
+    assert not gpu.lacks(problem.terms, scene)
     found = gpu.gradient(problem.terms, scene), gpu.directional(problem.terms, scene, direction)
     assert all(x.dtype == dtype for answer in (found[0][1], *found[1]) for x in answer.pair if x is not None)
     return relative_error(found, (soft_gradient(problem.terms, exact), soft_directional(problem.terms, exact, along)))

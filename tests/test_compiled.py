@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bbr_layer import Adam, Annealed, BBRLayer, CloudPair, Replay, RigidMotion, backend
 from bbr_layer.inner.adam import Moments, adam_direction, without_rounding
+from bbr_layer.kernels.choice import sweeps_for
 from bbr_layer.kernels.reference import soft_directional, soft_gradient
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 
@@ -65,8 +66,9 @@ def _same(found, wanted, tolerance):
 @pytest.mark.parametrize("name", TERMS)
 def test_compiled_sweeps_are_the_reference(name, d, masked, dtype, tolerance):
     scene, direction = _scene(name, d, masked, dtype)
-    if not cpu.supports(TERMS[name], scene):
-        assert masked and name == "N, clipped"
+    lacking = cpu.lacks(TERMS[name], scene)
+    if lacking:
+        assert (masked, name, lacking) == (True, "N, clipped", "clipped distances with padded points")
         return
     loss, gradient = cpu.gradient(TERMS[name], scene)
     wanted_loss, wanted = soft_gradient(TERMS[name], scene)
@@ -126,6 +128,17 @@ def test_without_numba_the_answer_is_the_same(name, monkeypatch):
     assert backend().name == "torch" and "numba is not installed" in backend().reason
     for compiled, plain in zip(*answers, strict=True):
         torch.testing.assert_close(compiled, plain, rtol=1e-10, atol=1e-12)
+
+
+def test_what_is_left_to_torch_is_told_once(caplog):
+    scene, _ = _scene("softBD", 3, False, torch.float64)
+    terms = TERMS["softBD"]._replace(outlier=3e-14)
+    sentence = (
+        "an epsilon of 3e-14, below 1e-12 is computed by torch, tens of times slower than what numba has compiled"
+    )
+    assert [sweeps_for(terms, scene).name for _ in range(2)] == ["torch", "torch"]
+    assert [record.getMessage() for record in caplog.records] == [sentence]
+    assert sweeps_for(TERMS["softBD"], scene).name == "numba"
 
 
 def test_the_backend_says_what_it_is_and_may_be_named(monkeypatch):

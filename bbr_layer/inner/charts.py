@@ -47,6 +47,10 @@ class RotationVector:
         """The motion between the centred and scaled clouds."""
         return RigidMotion(*state)
 
+    def slope(self, state: State, frame: Frame, by_motion: RigidMotion) -> Tensor:
+        """A derivative by the motion, ``(batch, d, d)`` and ``(batch, d)``, as one by the tangent at 0."""
+        return torch.cat((_torque(by_motion.rotation, state.turn), by_motion.translation), -1)
+
     def __repr__(self) -> str:
         return "RotationVector()"
 
@@ -69,13 +73,35 @@ class EulerAngles:
         """The motion between the centred clouds."""
         return frame.enter(RigidMotion(rotation_from_euler(state.turn), state.translation))
 
+    def slope(self, state: State, frame: Frame, by_motion: RigidMotion) -> Tensor:
+        """A derivative by the motion, ``(batch, d, d)`` and ``(batch, d)``, as one by the tangent at 0."""
+        shift = by_motion.translation / frame.scale[:, None]
+        turn = by_motion.rotation + shift[:, :, None] * frame.source_centre[:, None, :]
+        torque = _torque(turn, rotation_from_euler(state.turn))
+        if state.turn.shape[-1] == 3:
+            torque = (_euler_axes(state.turn) * torque[:, None]).sum(-1)
+        return torch.cat((torque, shift), -1)
+
     def __repr__(self) -> str:
         return "EulerAngles()"
 
 
+def _torque(by_rotation: Tensor, rotation: Tensor) -> Tensor:
+    """The derivative by w at 0 of what has ``by_rotation`` by R, where R becomes ``exp(w) R``, ``(batch, k)``."""
+    turned = by_rotation @ rotation.mT
+    twist = turned - turned.mT
+    if rotation.shape[-1] == 2:
+        return twist[:, 1, :1]
+    return torch.stack((twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]), -1)
+
+
+def _euler_axes(angles: Tensor) -> Tensor:
+    """Rows: the axes in space about which ``Rz Ry Rx`` turns as the angles about x, y and z grow, ``(batch, 3, 3)``."""
+    _, y, z = angles.unbind(-1)
+    zero, one = torch.zeros_like(y), torch.ones_like(y)
+    about_x = torch.stack((z.cos() * y.cos(), z.sin() * y.cos(), -y.sin()), -1)
+    about_y = torch.stack((-z.sin(), z.cos(), zero), -1)
+    return torch.stack((about_x, about_y, torch.stack((zero, zero, one), -1)), -2)
+
+
 Chart = RotationVector | EulerAngles
-
-
-def tangent_zero(batch: int, d: int, device: torch.device) -> Tensor:
-    """The tangent vector of no step, ``(batch, d (d + 1) / 2)`` float64."""
-    return torch.zeros(batch, rotation_dimensions(d) + d, dtype=torch.float64, device=device)

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.adam import Adam, Moments, adam_direction, without_rounding
-from bbr_layer.inner.charts import Chart, State, tangent_zero
+from bbr_layer.inner.charts import Chart, State
 from bbr_layer.inner.gauss_newton import GaussNewton, shortened
-from bbr_layer.inner.pose_gradient import PairKernel
+from bbr_layer.inner.pose_gradient import PairKernel, PoseSlope
 from bbr_layer.inner.squares_step import BoundSquares
 from bbr_layer.loss_base import Objective
 from bbr_layer.pair import Frame
@@ -116,25 +116,32 @@ def _gauss_newton_step(problem: Problem, inner: GaussNewton, at: Progress) -> Pr
 
 def loss_gradient(problem: Problem, state: State, temperature: Tensor, differentiable: bool) -> tuple[Tensor, Tensor]:
     """Loss ``(batch,)`` and its gradient ``(batch, k)`` in the pose's tangent at 0 and, if learned, the temperature."""
-    batch, d = problem.frame.target_centre.shape
-    with torch.enable_grad():
-        tangent = tangent_zero(batch, d, temperature.device).requires_grad_()
-        warmth = torch.zeros_like(temperature).requires_grad_()
-        motion = problem.chart.motion(problem.chart.moved(state, tangent), problem.frame)
-        warm = torch.maximum(temperature + warmth, floor(problem))
-        leaves = (tangent, warmth) if problem.temperature.learned else (tangent,)
-        cotangents: tuple[Tensor, ...]
-        values: tuple[Tensor, ...]
+    lowest = floor(problem)
+    with torch.set_grad_enabled(differentiable):
+        motion = problem.chart.motion(state, problem.frame)
+        warm = torch.maximum(temperature, lowest)
         if isinstance(problem.loss, PairKernel):
-            with torch.set_grad_enabled(differentiable):
-                loss, *slopes = problem.loss.slope(motion, warm)
-            values, cotangents = (*motion, warm), tuple(slopes)
+            slope = problem.loss.slope(motion, warm)
         else:
-            loss = problem.loss(motion, warm)
-            values, cotangents = (loss,), (torch.ones_like(loss),)
-        gradients = torch.autograd.grad(values, leaves, cotangents, create_graph=differentiable, materialize_grads=True)
-    columns = [gradients[0]] + [g[:, None] for g in gradients[1:]]
-    return loss if differentiable else loss.detach(), torch.cat(columns, dim=-1)
+            slope = _plain_slope(problem.loss, motion, warm, differentiable)
+        gradient = problem.chart.slope(state, problem.frame, RigidMotion(slope.rotation, slope.translation))
+        if problem.temperature.learned:
+            share = torch.where(temperature > lowest, 1.0, torch.where(temperature < lowest, 0.0, 0.5))
+            gradient = torch.cat((gradient, (slope.temperature * share)[:, None]), -1)
+    return slope.loss if differentiable else slope.loss.detach(), gradient
+
+
+def _plain_slope(loss: Objective, motion: RigidMotion, temperature: Tensor, differentiable: bool) -> PoseSlope:
+    """Of a function to differentiate.
+
+    Asked by what the pose has become, through a node of its own, and not by a leaf, the engine does not walk through
+    the graph of the steps before: that would make the time quadratic in the steps.
+    """
+    with torch.enable_grad():
+        at = [x.view_as(x) if x.requires_grad else x.detach().requires_grad_() for x in (*motion, temperature)]
+        found = loss(RigidMotion(at[0], at[1]), at[2])
+        slopes = torch.autograd.grad(found.sum(), at, create_graph=differentiable, materialize_grads=True)
+    return PoseSlope(found, *slopes)
 
 
 def cut_from_graph(problem: Problem, plain: Callable[[], Objective]) -> Problem:

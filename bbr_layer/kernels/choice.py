@@ -1,8 +1,10 @@
 """Which sweeps are used where, and why."""
 
 import importlib.util
+import logging
 import os
 from collections.abc import Callable
+from functools import cache
 from types import ModuleType
 from typing import NamedTuple
 
@@ -15,6 +17,7 @@ from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 # Names the backend for every device, where set: "numba", "triton" or "torch".
 VARIABLE = "BBR_BACKEND"
 NAMES = ("numba", "triton", "torch")
+LOGGER = logging.getLogger("bbr_layer")
 
 
 class Backend(NamedTuple):
@@ -36,18 +39,18 @@ class Sweeps(NamedTuple):
     name: str
     gradient: Callable[[SoftTerms, Scene], tuple[Tensor, Scene]]
     directional: Callable[[SoftTerms, Scene, Direction], tuple[Scene, Scene]]
-    supports: Callable[[SoftTerms, Scene], bool]
+    lacks: Callable[[SoftTerms, Scene], str]  # what it cannot do of what is asked, in words
 
 
-TORCH = Sweeps("torch", reference.soft_gradient, reference.soft_directional, lambda terms, scene: True)
+TORCH = Sweeps("torch", reference.soft_gradient, reference.soft_directional, lambda terms, scene: "")
 
 
 def backend(device: torch.device | str = "cpu") -> Backend:
     """What computes on ``device``, and why; the environment variable ``BBR_BACKEND`` overrides the choice.
 
     Matching by features (on a GPU, or between more than 2^25 pairs of points), clipping (on a GPU, or with padded
-    points) and an epsilon too small for exponentials that may underflow (``supports`` of each backend) are computed by
-    torch whatever the backend.
+    points) and an epsilon too small for exponentials that may underflow (``lacks`` of each backend) are computed by
+    torch whatever the backend; the log says so once.
 
     Raises
     ------
@@ -79,10 +82,20 @@ def sweeps_for(terms: SoftTerms, scene: Scene) -> Sweeps:
     if name == "torch":
         return TORCH
     chosen = _compiled(name)
-    return chosen if chosen.supports(terms, scene) else TORCH
+    lacking = chosen.lacks(terms, scene)
+    if not lacking:
+        return chosen
+    _tell(name, lacking)
+    return TORCH
+
+
+@cache
+def _tell(name: str, lacking: str) -> None:
+    """Say once in a process that something is slow, and why."""
+    LOGGER.warning("%s is computed by torch, tens of times slower than what %s has compiled", lacking, name)
 
 
 def _compiled(name: str) -> Sweeps:
     # Imported where it is first needed: both compilers take a second or more to load.
     module: ModuleType = importlib.import_module(f"bbr_layer.kernels.{'cpu' if name == 'numba' else 'gpu'}")
-    return Sweeps(name, module.gradient, module.directional, module.supports)
+    return Sweeps(name, module.gradient, module.directional, module.lacks)

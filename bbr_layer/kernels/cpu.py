@@ -37,15 +37,17 @@ FAR, LONG_NORMAL = 1e8, 10.0
 SMALLEST_OUTLIER = 1e-12
 
 
-def supports(terms: SoftTerms, scene: Scene) -> bool:
-    """Whether the compiled sweeps can do it: with an epsilon, clipped without padding only, features if not too many.
-
-    Distances of features are held for all pairs of an item.
-    """
+def lacks(terms: SoftTerms, scene: Scene) -> str:
+    """What the compiled sweeps cannot do of what is asked, in words; empty where they can do it all."""
     pair = scene.pair
-    padded = pair.P_mask is not None or pair.Q_mask is not None
-    held = terms.match == "points" or pair.P.shape[1] * pair.Q.shape[1] <= MOST_PAIRS
-    return held and not (terms.clip and padded) and terms.outlier >= SMALLEST_OUTLIER
+    # Distances of features are held for all pairs of an item.
+    if terms.match != "points" and pair.P.shape[1] * pair.Q.shape[1] > MOST_PAIRS:
+        return f"matching by features between more than {MOST_PAIRS} pairs of points"
+    if terms.clip and (pair.P_mask is not None or pair.Q_mask is not None):
+        return "clipped distances with padded points"
+    if terms.outlier < SMALLEST_OUTLIER:
+        return f"an epsilon of {terms.outlier:g}, below {SMALLEST_OUTLIER:g}"
+    return ""
 
 
 def loss_of(terms: SoftTerms) -> Loss:

@@ -32,14 +32,19 @@ class _Sums(NamedTuple):
     temperature: Tensor
 
 
-def supports(terms: SoftTerms, scene: Scene) -> bool:
-    """Whether the sweeps here can do what is asked; ``kernels.reference`` can do the rest."""
+def lacks(terms: SoftTerms, scene: Scene) -> str:
+    """What the sweeps here cannot do of what is asked, in words; ``kernels.reference`` can do it."""
     dtype = scene.pair.P.dtype
-    if dtype not in (torch.float32, torch.float64) or terms.match != "points" or terms.clip is not None:
-        return False
+    if dtype not in (torch.float32, torch.float64):
+        return str(dtype)
+    if terms.match != "points":
+        return "matching by features on a GPU"
+    if terms.clip is not None:
+        return "clipped distances on a GPU"
     # exp(-D / alpha) may underflow, in float32 beyond 87 temperatures, and buddies are at most its square over that of
     # epsilon: with an epsilon of at least the root of the smallest number, those underflow too, in any formula.
-    return terms.outlier >= torch.finfo(dtype).tiny ** 0.5
+    smallest = torch.finfo(dtype).tiny ** 0.5
+    return f"an epsilon of {terms.outlier:g}, below {smallest:.1g}" if terms.outlier < smallest else ""
 
 
 @torch.no_grad()
