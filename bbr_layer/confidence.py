@@ -4,15 +4,19 @@ Right means: rotation at most 5 degrees off, and the source's points at most 5 p
 from where they belong, on average. How well it is calibrated: docs/trust.md.
 """
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bbr_layer.matches import Matches
+from bbr_layer.geometry import RigidMotion
+from bbr_layer.matches import Matches, matched
 from bbr_layer.neighbourhoods import nearest_neighbours
 from bbr_layer.normals import estimate_normals
 from bbr_layer.pair import CloudPair
+from bbr_layer.rotations import rotation_from_rotvec
 from bbr_layer.thinning import thinned_pair
 
 # Points of each cloud that are judged: with 10 000 the sensor's noise is wider than the spacing, and fewer pairs of
@@ -25,6 +29,11 @@ NEAR = 2.0
 # Distinct points of the smaller cloud that the calibration begins with. Of k fewer the probability is at most k over
 # this: a handful of points fits nearly anything closely, and all three shares may be 1 by chance.
 FULLY_JUDGED = 100
+# Degrees that the source is turned by to see what fits anywhere, and the logits by which an answer must exceed that.
+# Chosen: surfaces and curves turned so have less than 0.2 percent, which is 6 logits and doubts nothing, whereas two
+# clouds that fill a volume have about 0 logits there, and 2 to 5 more once they are fitted to each other.
+ELSEWHERE_DEG = 40.0
+ELSEWHERE_LOGITS = 6.0
 # Logistic regression: of 1, share of the smaller cloud with a buddy, share of pairs on one plane, share of them near.
 # `python -m benchmarks.reliability` fits them.
 COEFFICIENTS = (-75.91, 19.45, 40.96, 36.26)
@@ -52,19 +61,21 @@ def judged_clouds(pair: CloudPair) -> CloudPair:
 
 
 @torch.no_grad()
-def confidence(pair: CloudPair, found: Matches) -> Float[Tensor, "batch"]:
+def confidence(pair: CloudPair, motion: RigidMotion, found: Matches) -> Float[Tensor, "batch"]:
     """Probability that the answer is right, in [0, 1], float64; 0 where no two points are buddies.
 
-    At most k / 100 where the smaller cloud has k < 100 distinct points.
+    At most k / 100 where the smaller cloud has k < 100 distinct points, and less where the source, turned away, would
+    fit about as well: that says nothing for the answer.
 
     Parameters
     ----------
     pair: as ``judged_clouds`` has it.
-    found: its pairs at the answer.
+    motion, found: the answer, and the pairs there.
     """
-    shares = statistics(pair, found)
-    weights = torch.tensor(COEFFICIENTS, dtype=torch.float64, device=shares.device)
-    probability = torch.sigmoid(weights[0] + shares @ weights[1:])
+    gaps = _gaps(pair.P, pair.P_mask), _gaps(pair.Q, pair.Q_mask)
+    at_answer = _logits(_shares(pair, found, gaps))
+    elsewhere = _logits(_shares(pair, matched(pair, turned_away(pair, motion)), gaps))
+    probability = torch.sigmoid(at_answer - (elsewhere + ELSEWHERE_LOGITS).clamp(min=0.0))
     most = (torch.minimum(*pair.real_counts()).double() / FULLY_JUDGED).clamp(max=1.0)
     return torch.where(found.mutual.any(-1), torch.nan_to_num(probability, nan=0.0).minimum(most), 0.0)
 
@@ -75,7 +86,32 @@ def statistics(pair: CloudPair, found: Matches) -> Float[Tensor, "batch 3"]:
 
     A pair's spacing is the mean of its two points' distances to the next points of their own clouds.
     """
-    spacing = (_gaps(pair.Q, pair.Q_mask) + _gaps(pair.P, pair.P_mask).gather(1, found.nearest)) / 2
+    return _shares(pair, found, (_gaps(pair.P, pair.P_mask), _gaps(pair.Q, pair.Q_mask)))
+
+
+@torch.no_grad()
+def turned_away(pair: CloudPair, motion: RigidMotion) -> RigidMotion:
+    """The motion after a turn of the centred source by 40 degrees: in space about its middle principal axis.
+
+    About that axis the fewest bodies are symmetric: one of revolution has its own at an end of the three.
+    """
+    angle = math.radians(ELSEWHERE_DEG)
+    if motion.dimension == 2:
+        turn = motion.translation.new_full((len(motion.translation), 1), angle)
+    else:
+        points = pair.Q.double() if pair.Q_mask is None else torch.where(pair.Q_mask[..., None], pair.Q.double(), 0.0)
+        turn = angle * torch.linalg.eigh(points.mT @ points).eigenvectors[..., 1]
+    return RigidMotion(motion.rotation @ rotation_from_rotvec(turn), motion.translation)
+
+
+def _logits(shares: Tensor) -> Tensor:
+    weights = torch.tensor(COEFFICIENTS, dtype=torch.float64, device=shares.device)
+    return weights[0] + shares @ weights[1:]
+
+
+def _shares(pair: CloudPair, found: Matches, gaps: tuple[Tensor, Tensor]) -> Tensor:
+    """The statistics, from the gaps of the points of P and of Q."""
+    spacing = (gaps[1] + gaps[0].gather(1, found.nearest)) / 2
     normals, _ = found.normal_parts()
     on_plane = (found.offsets * normals).sum(-1).abs() <= ON_PLANE * spacing
     near = torch.linalg.vector_norm(found.offsets, dim=-1) <= NEAR * spacing

@@ -146,7 +146,7 @@ def judged(pair: CloudPair, frame: Frame, ended: StageResult, steps: int) -> Reg
     status = torch.where(buddies == 0, int(Status.NO_BUDDIES), status)
     finite = torch.isfinite(motion.translation).all(-1) & torch.isfinite(motion.rotation).all(-1).all(-1)
     status = torch.where(finite, status, int(Status.NON_FINITE))
-    believed = torch.where(status <= int(Status.ITERATION_LIMIT), confidence(seen, pairs), 0.0)
+    believed = torch.where(status <= int(Status.ITERATION_LIMIT), confidence(seen, entered, pairs), 0.0)
     before = ended.loss, ended.temperature, ended.gradient_norm, torch.full_like(buddies, steps)
     return Registration(motion, *before, buddies, information, status, held, residual, radius, believed)
 

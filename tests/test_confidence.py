@@ -1,11 +1,16 @@
 """What must not change how far an answer is trusted: points given twice, padding; and that a handful says little."""
 
+import math
+
 import pytest
 import torch
 from problems import bumpy
 
-from bbr_layer import Adam, BBRLayer, GaussNewton, RigidMotion, Stage, Status
+from bbr_layer import Adam, BBRLayer, CloudPair, GaussNewton, RigidMotion, Stage, Status, angular_error
+from bbr_layer.confidence import COEFFICIENTS, confidence, judged_clouds, statistics, turned_away
 from bbr_layer.losses import BuddyFilter, SoftBD
+from bbr_layer.matches import matched
+from bbr_layer.preparation import prepared
 
 STILL = RigidMotion.identity(3)
 
@@ -43,6 +48,57 @@ def test_padding_is_no_duplicate():
 def test_few_points_are_believed_little_whatever_they_say(n):
     P, Q = torch.rand(n, 3), torch.rand(300, 3)
     assert 0 <= BBRLayer.fast()(P, Q).confidence <= n / 100
+
+
+def _in_ball(n, d):
+    directions = torch.nn.functional.normalize(torch.randn(n, d), dim=-1)
+    return directions * torch.rand(n, 1) ** (1 / d)
+
+
+VOLUMES = {
+    "ball": lambda n: _in_ball(n, 3),
+    "cube": lambda n: torch.rand(n, 3),
+    "normal": lambda n: torch.randn(n, 3),
+    "disc": lambda n: _in_ball(n, 2),
+}
+
+
+@pytest.mark.parametrize("volume", VOLUMES)
+def test_volumes_with_nothing_in_common_are_not_believed(volume):
+    for seed in range(3):
+        torch.manual_seed(seed)
+        assert BBRLayer()(VOLUMES[volume](800), VOLUMES[volume](800)).confidence < 0.5
+
+
+@pytest.mark.parametrize("volume", VOLUMES)
+def test_a_volume_and_its_noisy_copy_are_believed(volume):
+    P = VOLUMES[volume](800)
+    assert BBRLayer()(P, P + 0.01 * torch.randn_like(P)).confidence > 0.9
+
+
+def test_the_look_elsewhere_takes_nothing_from_a_surface():
+    clouds = CloudPair(*(x[None] for x in _samples(500)), *[None] * 9)
+    frame, pair = prepared(clouds, needs_normals=True, scaled=True)
+    seen, motion = judged_clouds(pair), frame.enter(RigidMotion.identity(3, (1,)))
+    found = matched(seen, motion)
+    shares = torch.cat((torch.ones(1, 1), statistics(seen, found)), -1).double()
+    plain = torch.sigmoid(shares @ torch.tensor(COEFFICIENTS).double())
+    torch.testing.assert_close(confidence(seen, motion, found), plain)
+    assert plain > 0.9
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_elsewhere_is_a_turn_about_the_middle_axis_of_the_cloud(d):
+    lengths = torch.arange(1.0, d + 1).double()
+    own, motion = (
+        RigidMotion.from_rotvec(torch.randn(1, 2 * d - 3).double(), torch.zeros(1, d).double()) for _ in range(2)
+    )
+    points = own.rotate(torch.cat((torch.diag(lengths), -torch.diag(lengths)))[None])
+    away = turned_away(CloudPair(points, points, *[None] * 9), motion)
+    assert math.degrees(angular_error(away.rotation, motion.rotation)) == pytest.approx(40, abs=1e-6)
+    if d == 3:
+        axis = own.rotation[:, :, 1:2]
+        torch.testing.assert_close(away.rotation @ axis, motion.rotation @ axis)
 
 
 def test_how_much_is_held_does_not_hang_on_padding():
