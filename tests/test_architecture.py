@@ -33,7 +33,7 @@ ORDER = {
         kernels.cpu_pairs kernels.cpu_matched kernels.gpu_sweeps kernels.gpu_clouds
         kernels.cpu_clipping
         kernels.cpu_matched_adjoint kernels.cpu_sweeps kernels.cpu_forces kernels.cpu_dual kernels.cpu_dual_forces
-        kernels.gpu_forces
+        kernels.gpu_forces kernels.cpu_squares_adjoint
         kernels.cpu_features
         kernels.cpu_feature_rates
         kernels.cpu_dual_planes kernels.gpu
@@ -49,9 +49,9 @@ ORDER = {
         confidence resistance
         registration
         inner
-        inner.schedules inner.charts
+        inner.schedules inner.charts inner.cotangents
         inner.adam inner.pose_gradient inner.gauss_newton
-        inner.squares_step
+        inner.squares_step inner.squares_course
         inner.unroll
         inner.compiled_scene inner.matched_scene inner.walk inner.squares_walk
         inner.run inner.implicit

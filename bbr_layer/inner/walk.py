@@ -5,7 +5,7 @@ the loss's gradient.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -13,14 +13,13 @@ from torch import Tensor
 
 from bbr_layer.embedding import AXES, matrices_in_space
 from bbr_layer.inner.adam import Adam
+from bbr_layer.inner.cotangents import as_field, item_of, room
 from bbr_layer.kernels.cpu_adam import Back, Course, Trace
 from bbr_layer.kernels.cpu_course import Adjoint
 from bbr_layer.once import once
 from bbr_layer.pair import CloudPair
 from bbr_layer.threads import side_by_side
 from bbr_layer.trees import in_space
-
-Tables = TypeVar("Tables", Trace, Back, Adjoint)
 
 
 class Scene(Protocol):
@@ -104,7 +103,7 @@ class _Walk(torch.autograd.Function):
         pair, d = CloudPair._make(fields), translation.shape[-1]
         scene, course = steps.look(pair, rounding), steps.course(temperatures, rates, d)
         trace = _begun(len(temperatures), rotation, translation, first, second)
-        side_by_side(lambda b: scene.walk(b, course(b), _item(trace, b)), len(translation))
+        side_by_side(lambda b: scene.walk(b, course(b), item_of(trace, b)), len(translation))
         ctx.steps, ctx.trace = steps, trace
         ctx.save_for_backward(*given)
         norm = torch.from_numpy(np.linalg.norm(trace.gradients[:, -1], axis=1))
@@ -133,13 +132,13 @@ class _Walk(torch.autograd.Function):
 
         def work(b: int) -> None:
             scene.walk_back(
-                b, course(b), _item(ctx.trace, b), (_item(back, b), _item(adjoint, b)), (heats[b], speeds[b])
+                b, course(b), item_of(ctx.trace, b), (item_of(back, b), item_of(adjoint, b)), (heats[b], speeds[b])
             )
 
         side_by_side(work, batch)
         lengths = adjoint.rounding[:, 0], heats.T, speeds.sum(axis=0)[:, axes]
         by_lengths = [torch.from_numpy(np.ascontiguousarray(x)) for x in lengths]
-        by_fields = [_as_field(adjoint, name, getattr(pair, name)) for name in CloudPair._fields]
+        by_fields = [as_field(adjoint, name, getattr(pair, name)) for name in CloudPair._fields]
         return [*by_lengths, *_free(back, d), *by_fields]
 
 
@@ -160,15 +159,9 @@ def _begun(steps: int, rotation: Tensor, translation: Tensor, first: Tensor, sec
 
 
 def _zero(pair: CloudPair) -> Adjoint:
-    (batch, n, _), m = pair.P.shape, pair.Q.shape[1]
-    vectors, numbers = ((batch, 3, n), (batch, 3, m)), ((batch, n), (batch, m))
-    features = [(batch, 0 if x is None else x.shape[-1], k) for x, k in ((pair.P_features, n), (pair.Q_features, m))]
-    return Adjoint(*(np.zeros(shape) for shape in (*vectors, *vectors, *numbers, (batch, 1), *features)))
-
-
-def _item(tables: Tables, number: int) -> Tables:
-    """The same of one item of a batch."""
-    return type(tables)(*(table[number] for table in tables))
+    sides = (pair.P_features, pair.P), (pair.Q_features, pair.Q)
+    features = [(len(points), 0 if x is None else x.shape[-1], points.shape[1]) for x, points in sides]
+    return Adjoint(*room(pair), *(np.zeros(shape) for shape in ((len(pair.P), 1), *features)))
 
 
 def _at(trace: Trace, step: int) -> Back:
@@ -188,11 +181,3 @@ def _spread(values: Tensor, axes: list[int]) -> np.ndarray:
     whole = np.zeros((len(values), 6))
     whole[:, axes] = values.numpy()
     return whole
-
-
-def _as_field(adjoint: Adjoint, name: str, field: Tensor | None) -> Tensor | None:
-    """The cotangent of a field of the pair, in its shape; None for what has none."""
-    if field is None or not hasattr(adjoint, name):
-        return None
-    table = torch.from_numpy(getattr(adjoint, name))
-    return (table if field.ndim == 2 else table[:, : field.shape[-1]].mT).to(field.dtype)

@@ -96,21 +96,43 @@ def _likeness(near, offset, normals):  # type: ignore[no-untyped-def]
 
 
 @compiled()
+def pull_of(clouds, placed, temperature):  # type: ignore[no-untyped-def]
+    """How much a pair of weight 1 pulls per unit of its residual, the residual, one over its rounded distance, and u.
+
+    A distance of 0, which only a temperature of 0 leaves, does not pull, and its inverse is 0. ``u``: see
+    ``steepness_of``.
+    """
+    _, turned, offset, plane, sign = placed
+    residual = dot(offset, plane)
+    squared = residual * residual + temperature * temperature
+    inverse = 1 / np.sqrt(squared) if squared > 0 else 0.0
+    steepness = steepness_of(clouds.flat, temperature, np.sqrt(squared))
+    facing = combined(sign, plane, -sign, turned)
+    return (
+        _likeness(clouds.near, offset, (facing, turned)) * steepness * steepness * inverse,
+        residual,
+        inverse,
+        steepness,
+    )
+
+
+@compiled()
+def torque_of(placed):  # type: ignore[no-untyped-def]
+    """The derivative of a pair's residual by a turn; by a shift it is the plane."""
+    arm, turned, offset, plane, _ = placed
+    return combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
+
+
+@compiled()
 def _pull(clouds, pairs, j, placing):  # type: ignore[no-untyped-def]
     """How much a pair pulls per unit of its residual, the residual, and its derivative by a turn and by a shift.
 
     ``placing`` is (pose, temperature, one over the weight of all pairs).
     """
     (index, _), (pose, temperature, scale) = pairs, placing
-    arm, turned, offset, plane, sign = place_of(clouds, index[j], j, pose)
-    residual = dot(offset, plane)
-    squared = residual * residual + temperature * temperature
-    facing = combined(sign, plane, -sign, turned)
-    weight = scale * clouds.P_weights[index[j]] * clouds.Q_weights[j] * _likeness(clouds.near, offset, (facing, turned))
-    torque = combined(1.0, cross(arm, plane), 1.0, cross(turned, offset))
-    rounded = np.sqrt(squared) if squared > 0 else 1.0
-    steepness = steepness_of(clouds.flat, temperature, rounded)
-    return weight * steepness * steepness / rounded, residual, torque, plane
+    placed = place_of(clouds, index[j], j, pose)
+    pull, residual, _, _ = pull_of(clouds, placed, temperature)
+    return scale * clouds.P_weights[index[j]] * clouds.Q_weights[j] * pull, residual, torque_of(placed), placed[3]
 
 
 @compiled()

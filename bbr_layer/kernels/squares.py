@@ -74,7 +74,8 @@ class MatchedSquares:
             weights = weights * pair.P_weights.gather(1, index)
         if pair.Q_weights is not None:
             weights = weights * pair.Q_weights
-        share = weights / or_one(weights.sum(-1, keepdim=True))
+        total = weights.sum(-1, keepdim=True)
+        share = torch.where(total > 0, weights / or_one(total), 0.0)  # without any weight there is no loss to follow
         if self.alike:
             share = share * likeness(offsets, (facing.double(), turned.double()), pair.known_spacing().double())
         rounding = temperature.double()[:, None]
