@@ -29,7 +29,14 @@ from bbr_layer import (
 from bbr_layer.distances import point_to_point
 
 NAMES = ["softBBS", "softBD", "N", "F"]
-LOSSES = {"softBBS": SoftBBS(), "softBD": SoftBD(), "N": SoftBDNormals(), "F": BuddyFilter()}
+AS_GIVEN = "N, signs as given"
+LOSSES = {
+    "softBBS": SoftBBS(),
+    "softBD": SoftBD(),
+    "N": SoftBDNormals(),
+    "F": BuddyFilter(),
+    AS_GIVEN: SoftBDNormals(align_signs=False),
+}
 HOT = (1.0, 0.5)
 NORMALS = ("P_normals", "Q_normals")
 
@@ -40,10 +47,10 @@ def _layer(name, steps=3, mode=None, **settings):
 
 
 class _Residuals:
-    """Residual of pair (i, j) as a function of a further turn and shift: an offset, or Eq. 7 with its sign."""
+    """Residual of pair (i, j) as a function of a further turn and shift: an offset, or Eq. 7, signed or as given."""
 
-    def __init__(self, pair, at, planes):
-        self.pair, self.at, self.planes = pair, at, planes
+    def __init__(self, pair, at, name):
+        self.pair, self.at, self.name = pair, at, name
         self.tangent = {2: 3, 3: 6}[pair.P.shape[-1]]
 
     def __call__(self, x, i, j):
@@ -51,10 +58,10 @@ class _Residuals:
         turn = RigidMotion.from_rotvec(x[:-d], x[-d:])
         p, arm = self.pair.P[0, i], self.at.rotation[0] @ self.pair.Q[0, j]
         offset = turn.rotation @ arm + self.at.translation[0] + x[-d:] - p
-        if not self.planes:
+        if self.name.startswith("soft"):
             return offset
         n_p, n_q = self.pair.P_normals[0, i], self.at.rotation[0] @ self.pair.Q_normals[0, j]
-        sign = -1.0 if torch.dot(n_p, n_q) < 0 else 1.0
+        sign = -1.0 if self.name != AS_GIVEN and torch.dot(n_p, n_q) < 0 else 1.0
         return torch.dot(offset, turn.rotation @ n_q + sign * n_p)
 
 
@@ -63,11 +70,12 @@ def _counts(name, pair, at, temperature):
     moved = pair.moved_by(at)
     D = point_to_point(moved)[0]
     weights = pair.P_weights[0][:, None] * pair.Q_weights[0]
-    planes = reference.point_to_plane_distances(moved.P[0], moved.Q[0], moved.P_normals[0], moved.Q_normals[0])
+    clouds = moved.P[0], moved.Q[0], moved.P_normals[0], moved.Q_normals[0]
+    planes = reference.point_to_plane_distances(*clouds, align_signs=name != AS_GIVEN)
     if name == "F":
         B = reference.hard_buddies(D) * weights
         counts = B / B.sum() / (planes.square() + temperature**2).sqrt()
-    elif name == "N":
+    elif name in ("N", AS_GIVEN):
         counts = reference.soft_buddies(planes, temperature, 1e-10) * weights / planes
     else:
         B = reference.soft_buddies(D, temperature, 1e-10) * weights
@@ -76,17 +84,24 @@ def _counts(name, pair, at, temperature):
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", LOSSES)
 def test_the_normal_equations_are_the_written_ones(name, d):
     pair, temperature = as_pair(noisy_pair(d), "normals", "weights"), torch.tensor([0.3], dtype=torch.float64)
     at = RigidMotion(*(x[None] for x in motion(d, 0.1, 0.05)))
-    wanted = reference.normal_equations(
-        _Residuals(pair, at, planes=name in ("N", "F")), _counts(name, pair, at, temperature[0])
-    )
+    wanted = reference.normal_equations(_Residuals(pair, at, name), _counts(name, pair, at, temperature[0]))
     squares = LOSSES[name].squares(pair)
     found = squares.equations(pair, at, temperature, squares.hold(at))
     torch.testing.assert_close(found.matrix[0], wanted[0], rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(found.slope[0], wanted[1], rtol=1e-9, atol=1e-12)
+
+
+def test_nothing_larger_than_all_pairs_is_kept_for_the_equations_of_n():
+    pair, temperature = as_pair(noisy_pair(3, n=50, m=60), "normals"), torch.tensor([0.3], dtype=torch.float64)
+    pair = pair._replace(Q=pair.Q.requires_grad_())
+    kept = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: kept.append(x.numel()) or x, lambda x: x):
+        SoftBDNormals().squares(pair).equations(pair, RigidMotion(*(x[None] for x in motion(3))), temperature, ())
+    assert max(kept) == 50 * 60
 
 
 @pytest.mark.parametrize("loss", [BuddyFilter(), BuddyFilter(reach=1.3)], ids=str)

@@ -25,8 +25,7 @@ class SoftSquares:
     """Pairs weighted by their soft buddies: softBBS by B, softBD and N, whose distances are not squared, by B / D.
 
     On points this is weighted Procrustes to second order in the turn of a step; no singular value decomposition is
-    taken, which has no derivative where two singular values meet. A step holds some tensors of n x m numbers (N: of
-    n x m x 2 d).
+    taken, which has no derivative where two singular values meet. A step holds some tensors of n x m numbers.
 
     Parameters
     ----------
@@ -54,16 +53,46 @@ class SoftSquares:
         return self._on_planes(moved, arms, pull) if self.terms.planes else _on_points(moved, arms, pull)
 
     def _on_planes(self, moved: CloudPair, arms: Tensor, pull: Tensor) -> Equations:
-        P_normals, turned = moved.both_normals()
-        sign = normal_signs(P_normals, turned)[..., None] if self.terms.align_signs else 1.0
-        offsets = (moved.Q[:, None] - moved.P[:, :, None]).double()
-        planes = (turned[:, None] + sign * P_normals[:, :, None]).double()
-        rows = plane_rows(
-            arms[:, None].expand_as(offsets), turned.double()[:, None].expand_as(offsets), offsets, planes
-        )
-        pulled = (rows * pull[..., None]).flatten(1, 2)
-        residual = (offsets * planes).sum(-1).flatten(1)
-        return Equations(pulled.mT @ rows.flatten(1, 2), (pulled * residual[..., None]).sum(1))
+        """A pair's row is linear in ``u = (1, p, s n_p)``: sums over p of products of u are all it takes of P."""
+        normals, pull = moved.both_normals(), pull.double()
+        sign = normal_signs(*normals).double() if self.terms.align_signs else torch.ones_like(pull)
+        P, Q, P_normals, turned = (x.double() for x in (moved.P, moved.Q, *normals))
+        points = torch.cat((torch.ones_like(P[..., :1]), P), -1)
+        heavy = pull * _residuals((P, Q), (P_normals, turned), sign)
+        slopes = torch.cat((heavy.mT @ points, (heavy * sign).mT @ P_normals), -1)
+        rows = _rows(arms, turned, Q)
+        matrix = rows.mT @ _moments(pull, sign, points, P_normals) @ rows
+        return Equations(matrix.sum(1), (rows * slopes[..., None]).sum((1, 2)))
+
+
+def _residuals(points: tuple[Tensor, Tensor], normals: tuple[Tensor, Tensor], sign: Tensor) -> Tensor:
+    """Of Eq. 7, ``(batch, n, m)``, by explicit differences."""
+    columns = zip(*(x.unbind(-1) for x in (*points, *normals)), strict=True)
+    parts = [(q[:, None] - p[..., None]) * (n_q[:, None] + sign * n_p[..., None]) for p, q, n_p, n_q in columns]
+    return sum(parts[1:], parts[0])
+
+
+def _moments(pull: Tensor, sign: Tensor, points: Tensor, normals: Tensor) -> Tensor:
+    """``sum_i pull_ij u_ij u_ij^T`` with ``u_ij = (points_i, sign_ij normals_i)``, ``(batch, m, 1 + 2 d, 1 + 2 d)``."""
+    k, d = points.shape[-1], normals.shape[-1]
+    even = torch.cat((_outer(points, points), _outer(normals, normals)), -1)  # a sign times itself is 1
+    by_points, by_normals = (pull.mT @ even).split((k * k, d * d), -1)
+    mixed = ((pull * sign).mT @ _outer(points, normals)).unflatten(-1, (k, d))
+    upper = torch.cat((by_points.unflatten(-1, (k, k)), mixed), -1)
+    return torch.cat((upper, torch.cat((mixed.mT, by_normals.unflatten(-1, (d, d))), -1)), -2)
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    return (a[..., :, None] * b[..., None, :]).flatten(-2)
+
+
+def _rows(arms: Tensor, turned: Tensor, Q: Tensor) -> Tensor:
+    """The rows of a source point's pairs as a linear map of ``(1, p, s n_p)``, ``(batch, m, 1 + 2 d, k)``."""
+    eye = torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device).expand(*Q.shape, Q.shape[-1])
+    none = torch.zeros_like(eye)
+    offsets = torch.cat((Q[..., None, :], -eye, none), -2)
+    planes = torch.cat((turned[..., None, :], none, eye), -2)
+    return plane_rows(arms[..., None, :].expand_as(offsets), turned[..., None, :].expand_as(offsets), offsets, planes)
 
 
 def _on_points(moved: CloudPair, arms: Tensor, pull: Tensor) -> Equations:
