@@ -30,8 +30,8 @@ NEAR = 2.0
 # this: a handful of points fits nearly anything closely, and all three shares may be 1 by chance.
 FULLY_JUDGED = 100
 # Degrees that the source is turned by to see what fits anywhere, and the logits by which an answer must exceed that.
-# Chosen: surfaces and curves turned so have less than 0.2 percent, which is 6 logits and doubts nothing, whereas two
-# clouds that fill a volume have about 0 logits there, and 2 to 5 more once they are fitted to each other.
+# Chosen: surfaces and curves turned so lie below -6 logits, which doubts nothing, whereas clouds that fill a volume lie
+# about 0, and a few logits higher once they are fitted to each other; tests/test_confidence.py has both.
 ELSEWHERE_DEG = 40.0
 ELSEWHERE_LOGITS = 6.0
 # Logistic regression: of 1, share of the smaller cloud with a buddy, share of pairs on one plane, share of them near.

@@ -63,13 +63,20 @@ def symmetric_point_to_plane(
         two of opposite sides would cancel; the printed equation has no such sign.
     """
     normals = pair.both_normals()
-    residual = torch.zeros((), dtype=pair.P.dtype, device=pair.P.device)
     sign = normal_signs(*normals) if align_signs else 1.0
-    columns = (x.unbind(-1) for x in (pair.P, pair.Q, *normals))
+    return smooth_root(plane_residuals((pair.P, pair.Q), normals, sign).square(), smoothing)
+
+
+def plane_residuals(
+    points: tuple[Tensor, Tensor], normals: tuple[Tensor, Tensor], sign: Tensor | float
+) -> Float[Tensor, "batch n m"]:
+    """``<q - p, n_q + sign n_p>`` for every pair, ``(batch, n, m)``: Eq. 7 before its absolute value."""
+    residual = torch.zeros((), dtype=points[0].dtype, device=points[0].device)
+    columns = (x.unbind(-1) for x in (*points, *normals))
     for p, q, p_normal, q_normal in zip(*columns, strict=True):
         offset = q[:, None, :] - p[:, :, None]
         residual = residual + offset * (q_normal[:, None, :] + sign * p_normal[:, :, None])
-    return smooth_root(residual.square(), smoothing)
+    return residual
 
 
 def normal_signs(P_normals: Tensor, Q_normals: Tensor) -> Tensor:

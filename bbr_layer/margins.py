@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 COMPILED = importlib.util.find_spec("numba") is not None
 
 # Points of clouds in which what the walk leaves open is compared with every point, rather than looked up in a tree from
-# Python. Chosen: far from the answer, where most is left open, the tree is faster from about 1200 points on; near it
-# comparing is as fast up to 3000, but there both are quick.
+# Python. Chosen: far from the answer, where most is left open, the tree soon wins; near it comparing does for longer,
+# but there both are quick.
 SMALL = 1024
 
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]

@@ -116,18 +116,16 @@ def _gauss_newton_step(problem: Problem, inner: GaussNewton, at: Progress) -> Pr
 
 def loss_gradient(problem: Problem, state: State, temperature: Tensor, differentiable: bool) -> tuple[Tensor, Tensor]:
     """Loss ``(batch,)`` and its gradient ``(batch, k)`` in the pose's tangent at 0 and, if learned, the temperature."""
-    lowest = floor(problem)
     with torch.set_grad_enabled(differentiable):
         motion = problem.chart.motion(state, problem.frame)
-        warm = torch.maximum(temperature, lowest)
+        warm = torch.maximum(temperature, floor(problem))
         if isinstance(problem.loss, PairKernel):
             slope = problem.loss.slope(motion, warm)
         else:
             slope = _plain_slope(problem.loss, motion, warm, differentiable)
         gradient = problem.chart.slope(state, problem.frame, RigidMotion(slope.rotation, slope.translation))
         if problem.temperature.learned:
-            share = torch.where(temperature > lowest, 1.0, torch.where(temperature < lowest, 0.0, 0.5))
-            gradient = torch.cat((gradient, (slope.temperature * share)[:, None]), -1)
+            gradient = torch.cat((gradient, slope.temperature[:, None]), -1)
     return slope.loss if differentiable else slope.loss.detach(), gradient
 
 

@@ -92,7 +92,7 @@ def sweeps_for(terms: SoftTerms, scene: Scene) -> Sweeps:
 @cache
 def _tell(name: str, lacking: str) -> None:
     """Say once in a process that something is slow, and why."""
-    LOGGER.warning("%s is computed by torch, tens of times slower than what %s has compiled", lacking, name)
+    LOGGER.warning("%s is computed by torch, slower than what %s has compiled", lacking, name)
 
 
 def _compiled(name: str) -> Sweeps:

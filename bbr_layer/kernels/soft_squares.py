@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from bbr_layer.distances import normal_signs
+from bbr_layer.distances import normal_signs, plane_residuals
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.kernels.scene import SoftTerms
 from bbr_layer.kernels.squares import Equations, cross, or_one, plane_rows, point_rows
@@ -58,18 +58,11 @@ class SoftSquares:
         sign = normal_signs(*normals).double() if self.terms.align_signs else torch.ones_like(pull)
         P, Q, P_normals, turned = (x.double() for x in (moved.P, moved.Q, *normals))
         points = torch.cat((torch.ones_like(P[..., :1]), P), -1)
-        heavy = pull * _residuals((P, Q), (P_normals, turned), sign)
+        heavy = pull * plane_residuals((P, Q), (P_normals, turned), sign)
         slopes = torch.cat((heavy.mT @ points, (heavy * sign).mT @ P_normals), -1)
         rows = _rows(arms, turned, Q)
         matrix = rows.mT @ _moments(pull, sign, points, P_normals) @ rows
         return Equations(matrix.sum(1), (rows * slopes[..., None]).sum((1, 2)))
-
-
-def _residuals(points: tuple[Tensor, Tensor], normals: tuple[Tensor, Tensor], sign: Tensor) -> Tensor:
-    """Of Eq. 7, ``(batch, n, m)``, by explicit differences."""
-    columns = zip(*(x.unbind(-1) for x in (*points, *normals)), strict=True)
-    parts = [(q[:, None] - p[..., None]) * (n_q[:, None] + sign * n_p[..., None]) for p, q, n_p, n_q in columns]
-    return sum(parts[1:], parts[0])
 
 
 def _moments(pull: Tensor, sign: Tensor, points: Tensor, normals: Tensor) -> Tensor:
