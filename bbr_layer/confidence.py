@@ -4,19 +4,17 @@ Right means: rotation at most 5 degrees off, and the source's points at most 5 p
 from where they belong, on average. How well it is calibrated: docs/trust.md.
 """
 
-import math
-
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bbr_layer.ellipsoid import turned_within
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.matches import Matches, matched
 from bbr_layer.neighbourhoods import nearest_neighbours
 from bbr_layer.normals import estimate_normals
 from bbr_layer.pair import CloudPair
-from bbr_layer.rotations import rotation_from_rotvec
 from bbr_layer.thinning import thinned_pair
 
 # Points of each cloud that are judged: with 10 000 the sensor's noise is wider than the spacing, and fewer pairs of
@@ -29,10 +27,11 @@ NEAR = 2.0
 # Distinct points of the smaller cloud that the calibration begins with. Of k fewer the probability is at most k over
 # this: a handful of points fits nearly anything closely, and all three shares may be 1 by chance.
 FULLY_JUDGED = 100
-# Degrees that the source is turned by to see what fits anywhere, and the logits by which an answer must exceed that.
+# Degrees that the source is turned by to see what fits anywhere, and the logits by which an answer must exceed the
+# worse of the two: a box fits itself turned by half a turn, and a street one turned by a little, but neither both.
 # Chosen: surfaces and curves turned so lie below -6 logits, which doubts nothing, whereas clouds that fill a volume lie
 # about 0, and a few logits higher once they are fitted to each other; tests/test_confidence.py has both.
-ELSEWHERE_DEG = 40.0
+ELSEWHERE_DEG = (40.0, 180.0)
 ELSEWHERE_LOGITS = 6.0
 # Logistic regression: of 1, share of the smaller cloud with a buddy, share of pairs on one plane, share of them near.
 # `python -m benchmarks.reliability` fits them.
@@ -64,17 +63,16 @@ def judged_clouds(pair: CloudPair) -> CloudPair:
 def confidence(pair: CloudPair, motion: RigidMotion, found: Matches) -> Float[Tensor, "batch"]:
     """Probability that the answer is right, in [0, 1], float64; 0 where no two points are buddies.
 
-    At most k / 100 where the smaller cloud has k < 100 distinct points, and less where the source, turned away, would
-    fit about as well: that says nothing for the answer.
+    At most k / 100 where the smaller cloud has k < 100 distinct points, and less where the source, turned within its
+    own ellipsoid, would fit about as well: that says nothing for the answer.
 
     Parameters
     ----------
     pair: as ``judged_clouds`` has it.
     motion, found: the answer, and the pairs there.
     """
-    gaps = _gaps(pair.P, pair.P_mask), _gaps(pair.Q, pair.Q_mask)
-    at_answer = _logits(_shares(pair, found, gaps))
-    elsewhere = _logits(_shares(pair, matched(pair, turned_away(pair, motion)), gaps))
+    gaps = point_gaps(pair)
+    at_answer, elsewhere = _logits(_shares(pair, found, gaps)), fit_elsewhere(pair, motion, gaps)
     probability = torch.sigmoid(at_answer - (elsewhere + ELSEWHERE_LOGITS).clamp(min=0.0))
     most = (torch.minimum(*pair.real_counts()).double() / FULLY_JUDGED).clamp(max=1.0)
     return torch.where(found.mutual.any(-1), torch.nan_to_num(probability, nan=0.0).minimum(most), 0.0)
@@ -86,22 +84,26 @@ def statistics(pair: CloudPair, found: Matches) -> Float[Tensor, "batch 3"]:
 
     A pair's spacing is the mean of its two points' distances to the next points of their own clouds.
     """
-    return _shares(pair, found, (_gaps(pair.P, pair.P_mask), _gaps(pair.Q, pair.Q_mask)))
+    return _shares(pair, found, point_gaps(pair))
 
 
 @torch.no_grad()
-def turned_away(pair: CloudPair, motion: RigidMotion) -> RigidMotion:
-    """The motion after a turn of the centred source by 40 degrees: in space about its middle principal axis.
+def fit_elsewhere(pair: CloudPair, motion: RigidMotion, gaps: tuple[Tensor, Tensor]) -> Float[Tensor, "batch"]:
+    """Logits of the source turned within its own ellipsoid: of two angles the one that fits worse."""
+    turned = (turned_within(pair, degrees) for degrees in ELSEWHERE_DEG)
+    return torch.stack([_logits(_shares(away, matched(away, motion), gaps)) for away in turned]).amin(0)
 
-    About that axis the fewest bodies are symmetric: one of revolution has its own at an end of the three.
-    """
-    angle = math.radians(ELSEWHERE_DEG)
-    if motion.dimension == 2:
-        turn = motion.translation.new_full((len(motion.translation), 1), angle)
-    else:
-        points = pair.Q.double() if pair.Q_mask is None else torch.where(pair.Q_mask[..., None], pair.Q.double(), 0.0)
-        turn = angle * torch.linalg.eigh(points.mT @ points).eigenvectors[..., 1]
-    return RigidMotion(motion.rotation @ rotation_from_rotvec(turn), motion.translation)
+
+@torch.no_grad()
+def point_gaps(pair: CloudPair) -> tuple[Float[Tensor, "batch n"], Float[Tensor, "batch m"]]:
+    """Distance of each point of P, and of Q, to the next one of its own cloud, float64."""
+    return _gaps(pair.P, pair.P_mask), _gaps(pair.Q, pair.Q_mask)
+
+
+def _gaps(points: Tensor, mask: Tensor | None) -> Tensor:
+    index = nearest_neighbours(points, 2, mask)[..., 1:]
+    next_ones = points.gather(1, index.expand_as(points))
+    return torch.linalg.vector_norm((points - next_ones).double(), dim=-1)
 
 
 def _logits(shares: Tensor) -> Tensor:
@@ -133,13 +135,6 @@ def _distinct(points: Tensor, mask: Tensor | None) -> Tensor | None:
         numbers = np.flatnonzero(own)
         rows[numbers[np.unique(cloud[numbers], axis=0, return_index=True)[1]]] = True
     return mask if (kept == real).all() else torch.from_numpy(kept).to(points.device)
-
-
-def _gaps(points: Tensor, mask: Tensor | None) -> Tensor:
-    """Distance of each point to the next one of its own cloud, ``(batch, n)`` float64."""
-    index = nearest_neighbours(points, 2, mask)[..., 1:]
-    next_ones = points.gather(1, index.expand_as(points))
-    return torch.linalg.vector_norm((points - next_ones).double(), dim=-1)
 
 
 def _with_normals(points: Tensor, normals: Tensor | None, mask: Tensor | None) -> Tensor:

@@ -46,7 +46,8 @@ ORDER = {
         loss_base
         losses
         matches directions start door thinning alike
-        confidence resistance
+        ellipsoid resistance
+        confidence
         registration
         inner
         inner.schedules inner.charts inner.cotangents

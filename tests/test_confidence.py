@@ -4,10 +4,12 @@ import math
 
 import pytest
 import torch
+import trimesh
 from problems import bumpy
 
-from bbr_layer import Adam, BBRLayer, CloudPair, GaussNewton, RigidMotion, Stage, Status, angular_error
-from bbr_layer.confidence import COEFFICIENTS, confidence, judged_clouds, statistics, turned_away
+from bbr_layer import Adam, BBRLayer, CloudPair, GaussNewton, RigidMotion, Stage, Status
+from bbr_layer.confidence import COEFFICIENTS, confidence, judged_clouds, statistics
+from bbr_layer.ellipsoid import turned_within
 from bbr_layer.losses import BuddyFilter, SoftBD
 from bbr_layer.matches import matched
 from bbr_layer.preparation import prepared
@@ -60,6 +62,11 @@ VOLUMES = {
     "cube": lambda n: torch.rand(n, 3),
     "normal": lambda n: torch.randn(n, 3),
     "disc": lambda n: _in_ball(n, 2),
+    "rod": lambda n: torch.rand(n, 3) * torch.tensor([6.0, 1.0, 1.0]),
+    "slab": lambda n: torch.rand(n, 3) * torch.tensor([8.0, 8.0, 1.0]),
+    "plank": lambda n: torch.rand(n, 3) * torch.tensor([8.0, 3.0, 1.0]),
+    "cigar": lambda n: torch.randn(n, 3) * torch.tensor([4.0, 1.0, 1.0]),
+    "strip": lambda n: torch.rand(n, 2) * torch.tensor([6.0, 1.0]),
 }
 
 
@@ -87,18 +94,50 @@ def test_the_look_elsewhere_takes_nothing_from_a_surface():
     assert plain > 0.9
 
 
+BOXES = {"room": (6.0, 4.0, 2.5), "beam": (6.0, 1.2, 1.0), "plate": (6.0, 5.0, 0.5)}
+
+
+@pytest.mark.parametrize("box", BOXES)
+def test_a_box_that_fits_itself_half_turned_is_believed(box):
+    mesh = trimesh.creation.box(BOXES[box])
+    P, Q = (torch.tensor(trimesh.sample.sample_surface(mesh, 1000, seed=k)[0]) for k in (1, 2))
+    assert BBRLayer()(P, Q).confidence > 0.9
+
+
+def _flat_cloud(d):
+    """Points of a plane or a line among others, some of them padding, and normals that are those of the plane."""
+    points = torch.randn(50, d).double() * torch.arange(1.0, d + 1) + 5
+    normal = torch.nn.functional.normalize(torch.randn(d).double(), dim=0)
+    points[:20] -= (points[:20] @ normal - 3)[:, None] * normal
+    pair = CloudPair(points[None], points[None], *[normal.expand(1, 50, d)] * 2)
+    return pair._replace(Q_mask=torch.arange(50)[None] < 40)
+
+
+@pytest.mark.parametrize("degrees", [40.0, 180.0])
 @pytest.mark.parametrize("d", [2, 3])
-def test_elsewhere_is_a_turn_about_the_middle_axis_of_the_cloud(d):
-    lengths = torch.arange(1.0, d + 1).double()
-    own, motion = (
-        RigidMotion.from_rotvec(torch.randn(1, 2 * d - 3).double(), torch.zeros(1, d).double()) for _ in range(2)
-    )
-    points = own.rotate(torch.cat((torch.diag(lengths), -torch.diag(lengths)))[None])
-    away = turned_away(CloudPair(points, points, *[None] * 9), motion)
-    assert math.degrees(angular_error(away.rotation, motion.rotation)) == pytest.approx(40, abs=1e-6)
-    if d == 3:
-        axis = own.rotation[:, :, 1:2]
-        torch.testing.assert_close(away.rotation @ axis, motion.rotation @ axis)
+def test_a_turn_within_the_ellipsoid_keeps_it_and_normals_with_their_surface(d, degrees):
+    pair = _flat_cloud(d)
+    turned = turned_within(pair, degrees)
+    before, after = pair.Q[0, :40], turned.Q[0, :40]
+    assert (before - after).norm(dim=1).mean() > 1
+    torch.testing.assert_close(after.mean(0), before.mean(0))
+    torch.testing.assert_close(after.T.cov(), before.T.cov())
+    heights = (turned.Q_normals * turned.Q)[0, :20].sum(-1)
+    torch.testing.assert_close(heights, heights[:1].expand(20))
+    torch.testing.assert_close(turned.Q_normals.norm(dim=-1), torch.ones(1, 50).double())
+
+
+def test_a_turn_of_a_ball_is_rigid_and_about_the_middle_axis():
+    points = torch.cat((torch.eye(3), -torch.eye(3))).double()[None] * torch.tensor([1.0, 1.0 + 1e-9, 1.0 + 2e-9])
+    turned = turned_within(CloudPair(points, points, points, points), 40.0).Q
+    torch.testing.assert_close(turned[0, 1], points[0, 1])
+    assert math.degrees(torch.arccos(turned[0, 0] @ points[0, 0])) == pytest.approx(40, abs=1e-6)
+
+
+def test_a_plane_can_be_turned():
+    flat = torch.rand(1, 50, 3) * torch.tensor([3.0, 2.0, 0.0])
+    turned = turned_within(CloudPair(flat, flat, flat, flat), 40.0)
+    assert turned.Q.isfinite().all() and turned.Q_normals.isfinite().all()
 
 
 def test_how_much_is_held_does_not_hang_on_padding():
