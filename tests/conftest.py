@@ -4,10 +4,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
+from differences import shapes_unchecked
 
 # Chosen before anything imports matplotlib: tests draw into files only.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -30,9 +30,8 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def as_a_user() -> Iterator[None]:
     """Turns the shape checks off, as they are outside the tests: for a test of what wrong input is told."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    with shapes_unchecked():
+        yield
 
 
 @pytest.fixture(scope="session")

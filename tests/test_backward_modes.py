@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from differences import gradgradcheck
 from problems import motion, noisy_pair
 
 from bbr_layer import (
@@ -156,7 +157,7 @@ def test_autograd_has_second_derivatives():
     given = noisy_pair(2)
     layer = BBRLayer("softBD", inner=Adam(3, 0.05), temperature=Annealed(*HOT), backward=Autograd())
     P = given["P"].requires_grad_()
-    assert torch.autograd.gradgradcheck(
+    assert gradgradcheck(
         lambda P: layer(P, given["Q"], start=motion(2, 0.1)).target_from_source.translation, (P,), atol=1e-3, rtol=1e-3
     )
 

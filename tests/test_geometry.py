@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import reference
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import motion
 
 from bbr_layer import RigidMotion, angular_error, translation_error
@@ -34,9 +35,9 @@ def test_exponential_and_logarithm(angle, k):
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 1.0, 3.1])
 def test_derivatives_of_exponential_and_logarithm(angle):
     rotvec = (torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64) * angle).requires_grad_()
-    assert torch.autograd.gradcheck(rotation_from_rotvec, (rotvec,))
-    assert torch.autograd.gradgradcheck(rotation_from_rotvec, (rotvec,))
-    assert torch.autograd.gradcheck(lambda w: rotvec_from_rotation(rotation_from_rotvec(w)), (rotvec,))
+    assert gradcheck(rotation_from_rotvec, (rotvec,))
+    assert gradgradcheck(rotation_from_rotvec, (rotvec,))
+    assert gradcheck(lambda w: rotvec_from_rotation(rotation_from_rotvec(w)), (rotvec,))
 
 
 def test_half_turn_has_an_axis_and_a_finite_gradient():

@@ -3,6 +3,7 @@
 import pytest
 import reference
 import torch
+from differences import gradcheck
 from scan_problems import in_the_world, random_batch, with_padding
 
 from bbr_layer import RigidMotion
@@ -115,7 +116,7 @@ def test_the_gradient_in_the_world_points(row, d):
     batch = measured(random_batch(d, n=7))
     term = build(row)  # at the end of the annealing, where the temperature does not follow the points
     points = in_the_world(batch).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: value(term, batch, x), (points,))
+    assert gradcheck(lambda x: value(term, batch, x), (points,))
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -131,7 +132,7 @@ def test_the_gradient_of_the_residual_in_the_corrections(informed, d):
     def at(x: torch.Tensor) -> torch.Tensor:
         return value(term, batch, world_from_scan=corrected(batch, x, 0.5))
 
-    assert torch.autograd.gradcheck(at, (correction,))
+    assert gradcheck(at, (correction,))
 
 
 @pytest.mark.parametrize("d", [2, 3])
