@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bbr_layer.ellipsoid import turned_within
+from bbr_layer.ellipsoid import half_turned, turned_within
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.matches import Matches, matched
 from bbr_layer.neighbourhoods import nearest_neighbours
@@ -27,11 +27,11 @@ NEAR = 2.0
 # Distinct points of the smaller cloud that the calibration begins with. Of k fewer the probability is at most k over
 # this: a handful of points fits nearly anything closely, and all three shares may be 1 by chance.
 FULLY_JUDGED = 100
-# Degrees that the source is turned by to see what fits anywhere, and the logits by which an answer must exceed the
-# worse of the two: a box fits itself turned by half a turn, and a street one turned by a little, but neither both.
-# Chosen: surfaces and curves turned so lie below -6 logits, which doubts nothing, whereas clouds that fill a volume lie
-# about 0, and a few logits higher once they are fitted to each other; tests/test_confidence.py has both.
-ELSEWHERE_DEG = (40.0, 180.0)
+# Degrees that the source is turned by to see what fits anywhere, beside half a turn, and the logits by which an answer
+# must exceed the worse of the two: a box fits itself turned by half a turn, and a street one turned by a little, but
+# neither both. Chosen: surfaces and curves lie below -6 logits, which doubts nothing, whereas clouds that fill a volume
+# lie about 0, and a few logits higher once they are fitted to each other: `python -m benchmarks.volumes`.
+ELSEWHERE_DEG = 40.0
 ELSEWHERE_LOGITS = 6.0
 # Logistic regression: of 1, share of the smaller cloud with a buddy, share of pairs on one plane, share of them near.
 # `python -m benchmarks.reliability` fits them.
@@ -89,9 +89,15 @@ def statistics(pair: CloudPair, found: Matches) -> Float[Tensor, "batch 3"]:
 
 @torch.no_grad()
 def fit_elsewhere(pair: CloudPair, motion: RigidMotion, gaps: tuple[Tensor, Tensor]) -> Float[Tensor, "batch"]:
-    """Logits of the source turned within its own ellipsoid: of two angles the one that fits worse."""
-    turned = (turned_within(pair, degrees) for degrees in ELSEWHERE_DEG)
-    return torch.stack([_logits(_shares(away, matched(away, motion), gaps)) for away in turned]).amin(0)
+    """Logits of the source turned within its own ellipsoid, by half a turn or a little: of both the worse.
+
+    Only half a turn where that alone says that there is nothing to doubt: a stretched cloud needs a tree of its own.
+    """
+    half = _logits(_shares(pair, matched(pair, half_turned(pair, motion)), gaps))
+    if not (half > -ELSEWHERE_LOGITS).any():
+        return half
+    away = turned_within(pair, ELSEWHERE_DEG)
+    return torch.minimum(half, _logits(_shares(away, matched(away, motion), gaps)))
 
 
 @torch.no_grad()
