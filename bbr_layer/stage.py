@@ -96,7 +96,13 @@ class Stage(nn.Module):
 
         ``attached(step)`` says which steps keep a graph; ``closed_form`` takes gradients from the kernels instead of
         differentiating the loss; of a stage that is not the ``last`` nobody asks the loss (NaN) and whether it settled.
+
+        Raises
+        ------
+        ValueError: outer training has taken a temperature or a rate to 0 or below.
         """
+        self.inner.check()
+        self.temperature.check()
         pair = thinned_pair(pair, self.points)
         problem = self._problem(pair, frame, closed_form)
         cut = cut_from_graph(problem, lambda: self.loss.objective(pair.detach()))

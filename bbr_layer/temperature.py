@@ -28,9 +28,13 @@ class Annealed(nn.Module):
 
     def __init__(self, start: float | Tensor = 2.0, end: float | Tensor = 1.0):
         super().__init__()
-        _check_positive("start", start)
-        _check_positive("end", end)
         self.start, self.end = start, end
+        self.check()
+
+    def check(self) -> None:
+        """Raises ValueError where a start or end is not positive: outer training may have taken it there."""
+        _check_positive("start", self.start)
+        _check_positive("end", self.end)
 
     def at(self, fraction: float | Tensor, spacing: Tensor) -> Tensor:
         """Temperature ``(batch,)`` when ``fraction`` in [0, 1] of the steps are done; of many ``(steps, 1)``, rows."""
@@ -68,9 +72,13 @@ class Learned(nn.Module):
 
     def __init__(self, start: float | Tensor = 1e-2, minimum: float = TEMPERATURE_FLOOR):
         super().__init__()
-        _check_positive("start", start)
-        _check_positive("minimum", minimum)
         self.start, self.minimum = start, minimum
+        self.check()
+
+    def check(self) -> None:
+        """Raises ValueError where a start or minimum is not positive: outer training may have taken it there."""
+        _check_positive("start", self.start)
+        _check_positive("minimum", self.minimum)
 
     def at(self, fraction: float | Tensor, spacing: Tensor) -> Tensor:
         """Refused: a learned temperature follows no schedule."""
@@ -93,6 +101,9 @@ class Unrounded(nn.Module):
 
     learned = False
 
+    def check(self) -> None:
+        """Nothing can be wrong."""
+
     def at(self, fraction: float | Tensor, spacing: Tensor) -> Tensor:
         """0 for every item, ``(batch,)``."""
         return torch.zeros_like(spacing)
@@ -111,7 +122,7 @@ Temperature = Annealed | Learned | Unrounded
 
 def _check_positive(name: str, value: float | Tensor) -> None:
     if not torch.as_tensor(value).gt(0).all():
-        raise ValueError(f"{name} is {value}; a temperature must be positive: try 1.0")
+        raise ValueError(f"{name} is {_number(value)}; a temperature must be positive: try 1.0")
 
 
 def _number(value: float | Tensor) -> float | str:

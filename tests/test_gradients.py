@@ -12,6 +12,7 @@ from bbr_layer import (
     Autograd,
     BBRLayer,
     Detached,
+    GaussNewton,
     Learned,
     RigidMotion,
     SoftBBS,
@@ -187,3 +188,31 @@ def test_learned_settings_are_parameters_of_the_layer():
     layer(given["P"], given["Q"]).loss.sum().backward()
     assert [name for name, _ in layer.named_parameters()] == ["stages.0.inner.rate"]
     assert rate.grad is not None and rate.grad.abs() > 0
+
+
+@pytest.mark.parametrize("value", [-0.1, 0.0, float("nan")])
+@pytest.mark.parametrize("temperature", [Annealed, Learned])
+def test_a_temperature_that_training_took_below_0_is_named(temperature, value):
+    layer = BBRLayer("softBD", inner=Adam(2), temperature=temperature(nn.Parameter(torch.tensor(0.5))))
+    given = noisy_pair(3)
+    layer(given["P"], given["Q"])
+    with torch.no_grad():
+        layer.stages[0].temperature.start.fill_(value)
+    with pytest.raises(ValueError, match="^start is Parameter.*; a temperature must be positive: try 1.0"):
+        layer(given["P"], given["Q"])
+
+
+def test_a_rate_that_training_took_below_0_is_named():
+    rate = nn.Parameter(torch.tensor(0.05))
+    layer, given = BBRLayer("softBD", inner=Adam(2, rate)), noisy_pair(3)
+    with torch.no_grad():
+        rate.fill_(-0.1)
+    with pytest.raises(ValueError, match="^rate is -0.1.*; a learning rate must be positive: try 0.1"):
+        layer(given["P"], given["Q"])
+
+
+def test_a_setting_changed_to_nonsense_is_named():
+    layer, given = BBRLayer("F", inner=GaussNewton(2)), noisy_pair(3)
+    layer.stages[0].inner.steps = 0
+    with pytest.raises(ValueError, match="^steps is 0; the inner registration needs a whole number"):
+        layer(given["P"], given["Q"])

@@ -111,20 +111,21 @@ class Adam(nn.Module):
         keep: str = "last",
     ):
         super().__init__()
-        if not isinstance(steps, int) or steps < 1:
-            raise ValueError(f"steps is {steps}; the inner registration needs a whole number, at least 1: try 60")
-        if keep not in ("last", "best"):
-            raise ValueError(f"keep is {keep!r}; it must be 'last' or 'best'")
-        for name, value in (
-            ("rate", rate),
-            ("translation_rate", translation_rate),
-            ("temperature_rate", temperature_rate),
-        ):
-            if value is not None and not torch.as_tensor(value).gt(0).all():
-                raise ValueError(f"{name} is {value}; a learning rate must be positive: try 0.1")
         self.steps, self.rate, self.schedule = steps, rate, Cosine() if schedule is None else schedule
         self.translation_rate, self.temperature_rate = translation_rate, temperature_rate
         self.betas, self.eps, self.shared, self.keep = betas, eps, shared, keep
+        self.check()
+
+    def check(self) -> None:
+        """Raises what the class does: outer training, or a setting changed by hand, may have made it wrong."""
+        if not isinstance(self.steps, int) or self.steps < 1:
+            raise ValueError(f"steps is {self.steps}; the inner registration needs a whole number, at least 1: try 60")
+        if self.keep not in ("last", "best"):
+            raise ValueError(f"keep is {self.keep!r}; it must be 'last' or 'best'")
+        for name in ("rate", "translation_rate", "temperature_rate"):
+            value = getattr(self, name)
+            if value is not None and not torch.as_tensor(value).gt(0).all():
+                raise ValueError(f"{name} is {_plain(value)}; a learning rate must be positive: try 0.1")
 
     def rates(self, sizes: tuple[int, ...], like: Tensor, steps: Sequence[int]) -> Tensor:
         """Rates ``(steps, k)`` of rotation, translation and temperature in blocks of ``sizes`` at the steps given."""

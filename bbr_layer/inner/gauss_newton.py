@@ -33,11 +33,15 @@ class GaussNewton(nn.Module):
 
     def __init__(self, steps: int = 20, *, damping: float = DAMPING):
         super().__init__()
-        if not isinstance(steps, int) or steps < 1:
-            raise ValueError(f"steps is {steps}; the inner registration needs a whole number, at least 1: try 20")
-        if not damping >= 0:
-            raise ValueError(f"damping is {damping}; it must not be negative: try {DAMPING}")
         self.steps, self.damping = steps, damping
+        self.check()
+
+    def check(self) -> None:
+        """Raises what the class does: a setting changed by hand may have made it wrong."""
+        if not isinstance(self.steps, int) or self.steps < 1:
+            raise ValueError(f"steps is {self.steps}; the inner registration needs a whole number, at least 1: try 20")
+        if not self.damping >= 0:
+            raise ValueError(f"damping is {self.damping}; it must not be negative: try {DAMPING}")
 
     def extra_repr(self) -> str:
         return f"steps={self.steps}" + (f", damping={self.damping}" if self.damping != DAMPING else "")
