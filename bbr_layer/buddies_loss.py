@@ -1,14 +1,17 @@
 """A best-buddies loss between two clouds as they lie: what a network is trained with in place of a Chamfer distance."""
 
+import warnings
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bbr_layer.door import batch_shape, checked_pair
+from bbr_layer.door import batch_shape, checked_pair, own_precision
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.loss_base import Loss
-from bbr_layer.losses import BuddyFilter
+from bbr_layer.losses import BuddyFilter, SoftBBS, SoftBD
+from bbr_layer.matches import matched, pair_weights
 from bbr_layer.named_stages import named_loss
 from bbr_layer.pair import CloudPair
 from bbr_layer.preparation import prepared
@@ -23,7 +26,8 @@ class BestBuddiesLoss(nn.Module):
 
     A Chamfer distance pulls every point to its nearest one; here only best buddies pull, so that what the other cloud
     does not have stays where it is. Soft buddies reach as far as about 20 temperatures: where clouds begin farther
-    apart than that many spacings, begin with a higher temperature.
+    apart than that many spacings softBBS and softBD are 0, as little as they can be, and have no gradient, which is
+    warned of. Then begin with a higher temperature, or with F, which pulls from any distance.
 
     Parameters
     ----------
@@ -89,15 +93,32 @@ class BestBuddiesLoss(nn.Module):
             raise RuntimeError(
                 "BestBuddiesLoss does not go through torch.func: use torch.autograd.grad, and batches for vmap"
             )
-        flat = checked_pair(given)
-        with torch.autocast(flat.P.device.type, enabled=False):
+        with own_precision(given) as widened:
+            flat = checked_pair(widened)
             frame, pair = prepared(flat, self.loss.needs_normals, False)
             temperature = self.temperature * self.loss.temperature_unit(pair).double().detach()
             rounding = self.loss.smoothing * pair.known_spacing().double().detach()
             still = frame.enter(RigidMotion.identity(pair.P.shape[-1], pair.P.shape[:1], device=pair.P.device))
             found = PairKernel(self.loss.kernel(pair), pair, rounding).slope(still, temperature).loss
+            if isinstance(self.loss, SoftBBS | SoftBD):
+                _warn_out_of_reach(found.detach(), pair, still)
         return found.to(flat.P.dtype).reshape(batch_shape(given.P))
 
     def extra_repr(self) -> str:
         """The temperature, beside the loss that a module prints by itself."""
         return f"temperature={self.temperature}"
+
+
+@torch.no_grad()
+def _warn_out_of_reach(loss: Tensor, pair: CloudPair, still: RigidMotion) -> None:
+    """Where a soft loss is 0 though best buddies lie apart."""
+    if not (loss == 0).any():
+        return
+    found = matched(pair, still)
+    apart = torch.linalg.vector_norm(found.offsets, dim=-1) * pair_weights(pair, found) * found.mutual
+    if ((loss == 0) & (apart.sum(-1) > 0)).any():
+        warnings.warn(
+            "no soft buddies are within reach: the loss is 0 and has no gradient; give a higher temperature, or begin "
+            "with BestBuddiesLoss('F')",
+            stacklevel=4,
+        )

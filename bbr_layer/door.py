@@ -1,6 +1,8 @@
 """The door of the layer: everything that comes in is checked once and brought to one batch dimension."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -13,6 +15,23 @@ from bbr_layer.pair import CloudPair
 def batch_shape(P: Tensor) -> tuple[int, ...]:
     """The leading batch dimensions of a cloud; ``()`` for a single one."""
     return tuple(P.shape[:-2])
+
+
+@contextmanager
+def own_precision(given: CloudPair) -> Iterator[CloudPair]:
+    """Autocast turned off, and what networks gave under it in half precision as wide as the widest of the rest."""
+    # What is no tensor is refused a little later, in words.
+    kind = given.P.device.type if isinstance(given.P, Tensor) and given.P.device.type != "meta" else "cpu"
+    widened = _widened(given) if torch.is_autocast_enabled(kind) else given
+    with torch.autocast(kind, enabled=False):
+        yield widened
+
+
+def _widened(given: CloudPair) -> CloudPair:
+    floating = [x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()]
+    widest = max(floating, key=lambda kind: torch.finfo(kind).bits, default=torch.float32)
+    half = torch.float16, torch.bfloat16
+    return CloudPair._make(x.to(widest) if isinstance(x, Tensor) and x.dtype in half else x for x in given)
 
 
 def checked_pair(given: CloudPair) -> CloudPair:

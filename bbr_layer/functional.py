@@ -21,6 +21,8 @@ GIVEN = {*CloudPair._fields, "start"} - {"P", "Q", "spacing"}
 def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Array | RigidMotion) -> Registration:
     """Find the motion that carries Q onto P; numpy arrays are answered in numpy, and may be of any type of number.
 
+    Where P or Q is a tensor the answer is in tensors, differentiable, and arrays become tensors of its kind.
+
     Parameters
     ----------
     P, Q: ``(*batch, n, d)`` target and ``(*batch, m, d)`` source; or each a ``Cloud`` as ``read_cloud`` gives it, with
@@ -56,8 +58,8 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
     start = given.pop("start", None)
     if start is not None:
         given["start"] = tensors(start) if isinstance(start, RigidMotion) else RigidMotion.from_matrix(_matrix(start))
-    if isinstance(P, torch.Tensor):
-        return chosen(P, Q, **given)
+    if tensor is not None:
+        return chosen(**{name: _beside(tensor, name, x) for name, x in {"P": P, "Q": Q, **given}.items()})
     answer: Registration = arrays(chosen(**_of_one_type({"P": P, "Q": Q, **given})))
     return answer
 
@@ -65,6 +67,14 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
 def _like(tensor: torch.Tensor | None, array: np.ndarray) -> Array:
     """What a file gave as a tensor of the kind of the other cloud, where that is one."""
     return array if tensor is None else from_array(array).to(tensor)
+
+
+def _beside(tensor: torch.Tensor, name: str, given: Array | RigidMotion | None) -> torch.Tensor | RigidMotion | None:
+    """An array as a tensor beside one, masks as they are."""
+    if given is None or isinstance(given, torch.Tensor | RigidMotion):
+        return given
+    array = _numbers(name, given)
+    return from_array(array).to(tensor.device, torch.bool if array.dtype == bool else tensor.dtype)
 
 
 def _matrix(start: Array) -> torch.Tensor:

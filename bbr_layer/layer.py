@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from bbr_layer.backward import Backward, Detached, Implicit, Replay, speak_up
 from bbr_layer.descent import descended, inner_steps
-from bbr_layer.door import batch_shape, checked_pair, checked_start
+from bbr_layer.door import batch_shape, checked_pair, checked_start, own_precision
 from bbr_layer.geometry import RigidMotion
 from bbr_layer.named_stages import default_stages, fast_stages, named_stage, paper_stage
 from bbr_layer.pair import CloudPair
@@ -103,7 +103,8 @@ class BBRLayer(nn.Module):
     def paper(name: str, backward: Backward | None = None) -> "BBRLayer":
         """The paper's ``"softBBS"``, ``"softBD"``, ``"N"`` or ``"F"`` with the constants of the authors' code.
 
-        For reproduction: rates are in metres of a 15 cm object, and the start is the identity.
+        For reproduction: rates are in metres of a 15 cm object, and the start is the identity. A gradient through
+        all its steps may overflow, with N it does: give ``backward=Truncated(20)``.
         """
         return BBRLayer(paper_stage(name), backward=backward)
 
@@ -152,8 +153,8 @@ class BBRLayer(nn.Module):
         """Check what came, and register it under the caller's mode of autograd, whichever that is."""
         keep_graph = torch.is_grad_enabled()
         outside_inference = torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
-        with outside_inference, torch.autocast(_device_type(given.P), enabled=False):
-            flat = checked_pair(given)
+        with outside_inference, own_precision(given) as widened:
+            flat = checked_pair(widened)
             begun = checked_start(start, flat, batch_shape(given.P))
             differentiable = keep_graph and self._wants_gradient(flat, begun)
             with torch.set_grad_enabled(differentiable):
@@ -192,8 +193,3 @@ class BBRLayer(nn.Module):
         settings += [] if self.starts in (None, 1) else [f"starts={self.starts}"]
         many = len(self.stages) > 1
         return "BBRLayer(\n  " + ",\n  ".join(settings) + "\n)" if many else f"BBRLayer({', '.join(settings)})"
-
-
-def _device_type(points: Tensor) -> str:
-    """Where autocast is turned off; what is no tensor is refused a little later, in words."""
-    return points.device.type if isinstance(points, Tensor) and points.device.type != "meta" else "cpu"

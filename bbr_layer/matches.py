@@ -62,11 +62,7 @@ def matched_information(
     """Gauss-Newton Hessian of the pairs' residuals, and the residuals' root mean square, in the data's unit."""
     scale = frame.scale[:, None, None]
     arms, offsets = motion.rotate(pair.Q.double()) * scale, found.offsets * scale
-    weights = found.mutual.double()
-    if pair.P_weights is not None:
-        weights = weights * pair.P_weights.gather(1, found.nearest)
-    if pair.Q_weights is not None:
-        weights = weights * pair.Q_weights
+    weights = found.mutual * pair_weights(pair, found)
     if found.normals is None:
         jacobian = point_rows(arms)
         information = torch.einsum("bn,bndk,bndl->bkl", weights, jacobian, jacobian)
@@ -79,6 +75,14 @@ def matched_information(
     present = total > 0
     mean = torch.where(found.mutual, weights * squared, 0.0).sum(-1) / torch.where(present, total, 1.0)
     return information, mean.sqrt()
+
+
+def pair_weights(pair: CloudPair, found: Matches) -> Float[Tensor, "batch m"]:
+    """Product of the weights of each source point and its nearest, float64."""
+    weights = torch.ones_like(found.offsets[..., 0])
+    if pair.P_weights is not None:
+        weights = weights * pair.P_weights.gather(1, found.nearest)
+    return weights if pair.Q_weights is None else weights * pair.Q_weights
 
 
 def summed(weights: Float[Tensor, "batch m"], jacobian: Float[Tensor, "batch m k"]) -> Float[Tensor, "batch k k"]:

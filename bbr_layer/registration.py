@@ -10,7 +10,7 @@ from torch import Tensor
 from bbr_layer.confidence import confidence, judged_clouds
 from bbr_layer.directions import Direction, named, spectrum
 from bbr_layer.geometry import RigidMotion
-from bbr_layer.matches import matched, matched_information
+from bbr_layer.matches import matched, matched_information, pair_weights
 from bbr_layer.pair import CloudPair, Frame, centre_and_radius
 from bbr_layer.resistance import resistance
 
@@ -33,7 +33,7 @@ class Status(IntEnum):
 _WORDS = {
     Status.CONVERGED: "converged",
     Status.ITERATION_LIMIT: "the pose was still moving at the last step: give it more steps, or a better start",
-    Status.NO_BUDDIES: "no two points are mutual nearest neighbours: check masks, overlap and the start",
+    Status.NO_BUDDIES: "no two points are mutual nearest neighbours: check masks, weights, overlap and the start",
     Status.DEGENERATE: "at least one direction of motion is not held by the points: do not trust it along that one",
     Status.NON_FINITE: "the pose is not finite: check the scale of the inputs and of the learning rates",
 }
@@ -143,7 +143,8 @@ def judged(pair: CloudPair, frame: Frame, ended: StageResult, steps: int) -> Reg
     free = spectrum(held, radius)[2].any(-1)
     status = torch.where(ended.settled, int(Status.CONVERGED), int(Status.ITERATION_LIMIT))
     status = torch.where(free, int(Status.DEGENERATE), status)
-    status = torch.where(buddies == 0, int(Status.NO_BUDDIES), status)
+    pulling = (found.mutual & (pair_weights(pair, found) > 0)).any(-1)
+    status = torch.where(pulling, status, int(Status.NO_BUDDIES))
     finite = torch.isfinite(motion.translation).all(-1) & torch.isfinite(motion.rotation).all(-1).all(-1)
     status = torch.where(finite, status, int(Status.NON_FINITE))
     believed = torch.where(status <= int(Status.ITERATION_LIMIT), confidence(seen, entered, pairs), 0.0)

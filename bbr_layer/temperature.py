@@ -56,7 +56,9 @@ class Annealed(nn.Module):
 class Learned(nn.Module):
     """The paper's temperature: a fixed start in the data's unit, then optimised together with the pose.
 
-    Measured: learning brings nothing over ``Annealed`` or harms; it is here for the paper's sake.
+    Measured: learning brings nothing over ``Annealed`` or harms; it is here for the paper's sake, with the rates of
+    ``BBRLayer.paper``. At the pose's own rate it falls to its floor at once, where no soft buddies are: give
+    ``Adam(temperature_rate=...)`` far less.
 
     Parameters
     ----------

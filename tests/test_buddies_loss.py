@@ -94,6 +94,7 @@ def test_no_pairs_by_pairs_are_kept_for_the_gradient(name):
     assert sizes and max(sizes) < 90 * 80 / 4
 
 
+@pytest.mark.filterwarnings("ignore:no soft buddies are within reach")
 @pytest.mark.parametrize("name", NAMES)
 def test_singular_clouds_have_finite_losses_and_gradients(name):
     P = bumpy(20, 3)
@@ -151,3 +152,26 @@ def test_wrong_settings_and_calls_get_one_sentence(as_a_user):
     ):
         with pytest.raises(ValueError, match=words):
             make()
+
+
+@pytest.mark.parametrize("name", ["softBBS", "softBD"])
+def test_clouds_out_of_reach_are_warned_of(name):
+    P = noisy_pair(3)["P"]
+    with pytest.warns(UserWarning, match="no soft buddies are within reach: the loss is 0 and has no gradient"):
+        assert BestBuddiesLoss(name)(P, P + 1000) == 0
+
+
+@pytest.mark.parametrize("name", ["softBBS", "softBD", "N", "F"])
+def test_nothing_is_warned_of_where_no_gradient_is_right(name, recwarn):
+    P = noisy_pair(3)["P"]
+    BestBuddiesLoss(name, 0.01)(P, P)
+    BestBuddiesLoss(name)(P, P + 1000, P_weights=torch.zeros(P.shape[:-1]).double())
+    assert not recwarn.list
+
+
+def test_what_a_network_gives_under_autocast_is_widened():
+    P, Q = (x.float()[0] for x in (noisy_pair(3)["P"], noisy_pair(3)["Q"]))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = BestBuddiesLoss("F")(P, Q.bfloat16())
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, BestBuddiesLoss("F")(P, Q.bfloat16().float()))

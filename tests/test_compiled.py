@@ -8,9 +8,21 @@ import torch
 from problems import noisy_pair
 from scipy.spatial.transform import Rotation
 
-from bbr_layer import Adam, Annealed, BBRLayer, CloudPair, Replay, RigidMotion, backend
+from bbr_layer import (
+    Adam,
+    Annealed,
+    BBRLayer,
+    CloudPair,
+    EulerAngles,
+    Learned,
+    Replay,
+    RigidMotion,
+    SoftBD,
+    Stage,
+    backend,
+)
 from bbr_layer.inner.adam import Moments, adam_direction, without_rounding
-from bbr_layer.kernels.choice import sweeps_for
+from bbr_layer.kernels.choice import sweeps_for, tell_slow
 from bbr_layer.kernels.reference import soft_directional, soft_gradient
 from bbr_layer.kernels.scene import Direction, Scene, SoftTerms
 
@@ -137,6 +149,22 @@ def test_what_is_left_to_torch_is_told_once(caplog):
     assert [sweeps_for(terms, scene).name for _ in range(2)] == ["torch", "torch"]
     assert [record.getMessage() for record in caplog.records] == [sentence]
     assert sweeps_for(TERMS["softBD"], scene).name == "numba"
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"inner": Adam(2, keep="best")}, "a walk with keep='best'"),
+        ({"inner": Adam(2), "temperature": Learned(1.0)}, "a walk with a learned temperature"),
+        ({"inner": Adam(2), "chart": EulerAngles()}, "a walk in EulerAngles()"),
+    ],
+)
+def test_steps_that_are_not_compiled_are_told_of_once(settings, words, caplog):
+    tell_slow.cache_clear()
+    layer, given = BBRLayer(Stage(SoftBD(), **settings)), noisy_pair(3)
+    for _ in range(2):
+        layer(given["P"], given["Q"])
+    assert [record.getMessage().split(" is computed")[0] for record in caplog.records] == [words]
 
 
 def test_the_backend_says_what_it_is_and_may_be_named(monkeypatch):

@@ -257,3 +257,10 @@ def test_detached_layer_still_moves_its_argument_differentiably():
     (gradient,) = torch.autograd.grad(moved.sum(), Q)
     expected = result.target_from_source.rotation[0].sum(0).expand(9, 3)
     torch.testing.assert_close(gradient[0], expected.detach())
+
+
+@pytest.mark.parametrize("layer", [BBRLayer(), BBRLayer.robust(), BBRLayer("N")], ids=["default", "robust", "N"])
+def test_without_any_weight_there_are_no_buddies(layer):
+    given = noisy_pair(3)
+    found = layer(given["P"], given["Q"], P_weights=torch.zeros(given["P"].shape[:-1]).double())
+    assert found.status == Status.NO_BUDDIES and found.confidence == 0

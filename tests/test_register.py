@@ -147,3 +147,15 @@ def test_wide_numbers_are_made_narrower_and_ragged_ones_refused(as_a_user):
     assert register(points, points).target_from_source.rotation.dtype == np.float64
     with pytest.raises(ValueError, match="P is no array of numbers, its rows are not of one length"):
         register([[0.0, 1.0], [2.0]], points)
+
+
+@pytest.mark.parametrize("tensor", ["P", "Q"])
+def test_a_tensor_beside_an_array_is_answered_in_tensors(tensor):
+    given = {"P": bumpy(60, 3).double(), "Q": bumpy(60, 3).double()}
+    mask = np.arange(60) < 50
+    mixed = {k: x.clone().requires_grad_() if k == tensor else x.numpy() for k, x in given.items()}
+    found = register(**mixed, P_mask=mask, Q_weights=np.ones(60))
+    plain = register(**given, P_mask=torch.from_numpy(mask), Q_weights=torch.ones(60).double())
+    torch.testing.assert_close(found.target_from_source.matrix.detach(), plain.target_from_source.matrix)
+    found.target_from_source.matrix.square().sum().backward()
+    assert mixed[tensor].grad.isfinite().all()

@@ -104,6 +104,18 @@ def test_autocast_changes_nothing(layer):
     assert torch.equal(found[0], torch.autograd.grad(_number(layer, P, given["Q"]), P)[0])
 
 
+def test_what_networks_give_under_autocast_is_widened():
+    given = {k: v.float() for k, v in noisy_pair(3).items()}
+    P, Q, features = given["P"], given["Q"], [given[k].bfloat16() for k in ("P_features", "Q_features")]
+    layer = BBRLayer("softBD", inner=Adam(3))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = layer(P, Q.bfloat16(), P_features=features[0], Q_features=features[1])
+    plain = layer(P, Q.bfloat16().float(), P_features=features[0].float(), Q_features=features[1].float())
+    assert torch.equal(found.target_from_source.matrix, plain.target_from_source.matrix)
+    with pytest.raises(ValueError, match="Q has dtype torch.bfloat16"):
+        layer(P, Q.bfloat16())
+
+
 def _learning():
     rate = nn.Parameter(torch.tensor(0.05, dtype=torch.float64))
     layer = BBRLayer("softBD", inner=Adam(5, rate), temperature=Learned(1.0))

@@ -15,7 +15,7 @@ from bbr_layer.inner.gauss_newton import GaussNewton
 from bbr_layer.inner.pose_gradient import PairKernel
 from bbr_layer.inner.unroll import Problem, Progress, begin, detached, floor, share_done, step
 from bbr_layer.kernels import scene as kernel_scene
-from bbr_layer.kernels.choice import backend, sweeps_for
+from bbr_layer.kernels.choice import backend, sweeps_for, tell_slow
 from bbr_layer.kernels.matched import MatchedKernel
 from bbr_layer.kernels.soft import SoftKernel
 from bbr_layer.kernels.squares import MatchedSquares
@@ -78,7 +78,9 @@ def _look(problem: Problem) -> "Callable[[CloudPair, Tensor], Scene] | None":
     loss, inner = problem.loss, problem.inner
     if not isinstance(inner, Adam) or not isinstance(loss, PairKernel) or loss.pair.P.device.type != "cpu":
         return None
-    if problem.temperature.learned or inner.keep != "last" or not isinstance(problem.chart, RotationVector):
+    if uncompiled := _uncompiled(problem):
+        if backend("cpu").name == "numba":
+            tell_slow("numba", uncompiled)
         return None
     # What is compiled is imported where it is used: Numba takes long to load, and may be missing.
     if isinstance(loss.kernel, MatchedKernel) and backend("cpu").name == "numba":
@@ -92,6 +94,15 @@ def _look(problem: Problem) -> "Callable[[CloudPair, Tensor], Scene] | None":
 
             return partial(CompiledScene, terms)
     return None
+
+
+def _uncompiled(problem: Problem) -> str:
+    """What keeps the steps of Adam from being compiled; "" if nothing does."""
+    if problem.temperature.learned:
+        return "a walk with a learned temperature"
+    if problem.inner.keep != "last":
+        return f"a walk with keep={problem.inner.keep!r}"
+    return "" if isinstance(problem.chart, RotationVector) else f"a walk in {problem.chart!r}"
 
 
 def _walked(

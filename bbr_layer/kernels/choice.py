@@ -85,12 +85,12 @@ def sweeps_for(terms: SoftTerms, scene: Scene) -> Sweeps:
     lacking = chosen.lacks(terms, scene)
     if not lacking:
         return chosen
-    _tell(name, lacking)
+    tell_slow(name, lacking)
     return TORCH
 
 
 @cache
-def _tell(name: str, lacking: str) -> None:
+def tell_slow(name: str, lacking: str) -> None:
     """Say once in a process that something is slow, and why."""
     LOGGER.warning("%s is computed by torch, slower than what %s has compiled", lacking, name)
 
