@@ -147,8 +147,9 @@ def _checked(name: str, poses: np.ndarray) -> np.ndarray:
         raise ValueError(f"{name} has poses that are NaN or infinite: leave those scans out")
     rotations = poses[:, :3, :3]
     off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    if (off > ORTHOGONAL_TOLERANCE).any() or (np.linalg.det(rotations) < 0).any():
-        raise ValueError(f"{name} has a pose that is no rigid motion (the first is number {off.argmax()})")
+    wrong = (off > ORTHOGONAL_TOLERANCE) | (np.linalg.det(rotations) < 0)
+    if wrong.any():
+        raise ValueError(f"{name} has a pose that is no rigid motion (the first is number {wrong.argmax()})")
     return poses
 
 

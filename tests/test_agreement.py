@@ -7,7 +7,7 @@ from small_worlds import displaced, true_edges, true_poses, world_of
 from bbr_layer import RigidMotion
 from benchmarks.false_loops import Wrong, wrong_loops
 from train import agreement
-from train.agreement import agreed_poses
+from train.agreement import FAINTEST, _by_score, agreed_poses
 from train.given_motion import GIVEN
 from train.pose_graph import Edges, solve_pose_graph
 from train.prepared import prepare
@@ -101,3 +101,11 @@ def test_given_motions_keep_their_strength_and_are_not_asked(monkeypatch):
     monkeypatch.setattr(agreement, "scores", lambda *of: asked.append(len(of[1][0])) or spied(*of))
     assert _off(agreed_poses(SCENE, both, (displaced(TRUTH, 0.02),))[0]) < 1e-6
     assert asked and max(asked) <= len(edges.target)
+
+
+def test_a_registered_edge_of_score_0_still_pulls():
+    edges = true_edges(SCANS)
+    score = torch.ones_like(edges.score)
+    score[2] = 0.0
+    pulls = _by_score(edges._replace(score=score)).information
+    torch.testing.assert_close(pulls[2], FAINTEST**2 * edges.information[2])

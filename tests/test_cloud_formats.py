@@ -188,3 +188,15 @@ def test_las_without_its_library_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr("bbr_layer.cloud_formats.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r'not installed: pip install "laspy\[lazrs\]"'):
         read_cloud(tmp_path / "a.laz")
+
+
+def test_bin_whose_fifth_numbers_are_too_large_for_lasers_is_kitti(tmp_path, rng):
+    values = rng.random((4, 5)).astype(np.float32)
+    values[:, 4] = 1000
+    values.tofile(tmp_path / "a.bin")
+    assert len(read_cloud(tmp_path / "a.bin").points) == 5
+
+
+def test_the_vertices_of_a_mesh_keep_their_order(tmp_path):
+    (tmp_path / "a.off").write_text("OFF\n3 1 0\n2 0 0\n0 1 0\n1 0 1\n3 0 1 2\n")
+    assert read_cloud(tmp_path / "a.off").points.tolist() == [[2, 0, 0], [0, 1, 0], [1, 0, 1]]

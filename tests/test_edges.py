@@ -10,6 +10,7 @@ from train import edges as edges_file
 from train.chain import POOR, consecutive
 from train.config import EdgeConfig
 from train.edges import NEAR, register_edges
+from train.given_motion import GIVEN
 from train.loops import DOUBTED, again
 from train.pose_graph import Edges, solve_pose_graph
 from train.prepared import prepare
@@ -250,3 +251,18 @@ def test_a_doubted_edge_that_the_poses_nearly_agree_with_counts_in_the_refinemen
     belief[4] = 0.7
     edges_file.refined(full, scene, (edges._replace(target_from_source=off), belief), poses, silent)
     np.testing.assert_allclose(asked["trust"], [1.0, 0.64, 0.0, 0.0, 0.7] + [1.0] * (count - 5), rtol=1e-6)
+
+
+def test_a_given_motion_that_the_graph_does_not_believe_stays_as_it_was():
+    scans = _room(3)
+    scene, truth = build_scene(scans, prepare(scans, 180)), RigidMotion.from_matrix(torch.from_numpy(scans.truth))
+    edges = _edges(truth, [(0, 1), (1, 2), (1, 2)])
+    wrong = edges.target_from_source.translation.clone()
+    wrong[2] += 0.5
+    edges = edges._replace(
+        target_from_source=RigidMotion(edges.target_from_source.rotation, wrong),
+        score=torch.tensor([0.9, 0.9, 0.0]).double(),
+        kind=torch.tensor([0, 0, GIVEN]),
+    )
+    found = again(scene, edges, torch.tensor([1.0, 1.0, 0.0]).double(), truth, None)
+    assert torch.equal(found.target_from_source.matrix, edges.target_from_source.matrix)

@@ -182,3 +182,16 @@ def test_poses_written_with_six_digits_are_taken_for_the_rotations_they_mean(rng
     errors = evaluate_trajectory(exact, written)
     assert errors["ape_rmse"] < 1e-5
     assert errors["rpe_rotation_rmse_deg"] < 1e-3
+
+
+def test_positions_come_before_orientations_however_short_the_path():
+    truth, estimate = straight_path(5), straight_path(5)
+    truth[:, :3, 3] *= 1e-3
+    estimate[:, :3, 3] = truth[:, [1, 0, 2], 3]  # along y, the orientations left as they were
+    assert evaluate_trajectory(ELSEWHERE @ estimate, ELSEWHERE @ truth)["ape_max"] < 1e-7
+
+
+def test_orientations_are_never_compared_in_a_mirror():
+    truth = straight_path(3)
+    halves = poses_from(Rotation.from_rotvec(np.pi * np.eye(3)), truth[:, :3, 3])  # their sum is a reflection
+    np.testing.assert_allclose(np.sort(pose_errors(halves, truth)[1]), [0, 180, 180], atol=1e-6)

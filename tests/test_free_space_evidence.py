@@ -116,3 +116,19 @@ def test_what_moved_leaves_the_map(tmp_path, monkeypatch):
         tmp_path, MapResult(_hall(walks=False)[0], scans.truth, edges._replace(score=torch.zeros(len(edges.score))))
     )
     assert not (tmp_path / "movers.ply").exists()
+
+
+def test_a_point_at_the_sensor_is_no_ray():
+    scans = _hall(walks=False)[0]
+    with_origin = ScanSet(
+        [np.vstack((np.zeros((1, 2)), points)) for points in scans.points], scans.names, scans.timestamps
+    )
+    view = range_views(with_origin, surfaces(prepare(scans, RAYS)))[0]
+    assert view is not None and len(view.ranges) == RAYS
+
+
+def test_edges_that_nobody_believes_bear_no_witness():
+    scans, _ = _hall(walks=True)
+    edges = true_edges(scans)
+    moving = MovingPoints(scans, edges._replace(score=torch.zeros_like(edges.score)), scans.truth)
+    assert not moving.found.any() and not moving.seen_through.any()

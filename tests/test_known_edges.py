@@ -61,3 +61,11 @@ def test_the_origin_tells_files_apart(tmp_path):
 def test_scans_without_poses_are_refused():
     with pytest.raises(ValueError, match="came without poses"):
         KnownEdges()(small_world(), EdgeConfig())
+
+
+def test_of_several_loops_the_nearest_in_space_are_taken():
+    poses = true_poses(small_world())
+    poses.translation[:, 0] = torch.tensor([0.0, 50, 100, 150, 200, 0.3, 0.1, 0.2])
+    poses.translation[:, 1] = 0
+    edges = neighbouring(small_world(), poses, EdgeConfig(window=1, loops_per_scan=1))
+    assert edges.source[(edges.target == 0) & (edges.kind == 2)].tolist() == [6]

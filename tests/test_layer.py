@@ -21,6 +21,7 @@ from bbr_layer import (
     Truncated,
     angular_error,
 )
+from bbr_layer.checks import check_normals, check_weights
 
 NAMES = ["softBBS", "softBD", "N", "F"]
 
@@ -264,3 +265,14 @@ def test_without_any_weight_there_are_no_buddies(layer):
     given = noisy_pair(3)
     found = layer(given["P"], given["Q"], P_weights=torch.zeros(given["P"].shape[:-1]).double())
     assert found.status == Status.NO_BUDDIES and found.confidence == 0
+
+
+def test_padding_may_hold_any_weights_and_normals():
+    points, mask = torch.rand(3, 3), torch.tensor([True, True, False])
+    check_weights("P_weights", torch.tensor([1.0, 0.0, -1.0]), points, mask)
+    check_normals("P_normals", torch.eye(3) * mask[:, None], points, mask)
+
+
+def test_a_source_in_one_place_has_radius_1():
+    P = torch.rand(30, 3)
+    assert BBRLayer("F")(P, P[:1].expand(30, 3)).radius == 1

@@ -1,16 +1,22 @@
 """The command line: two files registered, the answer for people and for programs, and what bad input is told."""
 
+import io
 import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from bbr_layer import read_cloud, write_cloud
 from bbr_layer.__main__ import app
+from bbr_layer.answer import _plain, described, show, write_moved
+from bbr_layer.clouds import Cloud
+from bbr_layer.directions import Direction
+from bbr_layer.two_clouds import _stages, common_dimension, register_clouds
 
 # Whole points of each cloud are fewer than the command's default, so that the tests are fast.
 COUNT = 200
@@ -181,3 +187,45 @@ def test_bad_input_of_the_whole_program(tmp_path):
     assert ended.returncode == 2
     assert "does not exist" in ended.stderr
     assert "Traceback" not in ended.stderr + ended.stdout
+
+
+def test_the_share_of_buddies_is_that_of_the_smaller_cloud(rng):
+    points = rng.random((60, 3))
+    for clouds in ((points, points[:30]), (points[:30], points)):
+        verdict = register_clouds(*(Cloud(some) for some in clouds), start=np.eye(4)).verdict
+        assert verdict.buddies > 20 and verdict.buddy_share == verdict.buddies / 30
+
+
+def test_the_moved_source_is_written_with_its_normals_turned(tmp_path, rng):
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
+    normals = rng.normal(size=(20, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    write_moved(tmp_path / "moved.ply", Cloud(rng.random((20, 3)), normals), turn)
+    wanted = Rotation.from_matrix(turn[:3, :3]).apply(normals)
+    np.testing.assert_allclose(read_cloud(tmp_path / "moved.ply").normals, wanted, atol=1e-12)
+
+
+def test_soft_stages_alone_see_as_few_points_as_asked():
+    assert _stages("softBD", "default", 50)[0].points == 50
+    assert _stages("F", "default", 50)[0].points is None
+    assert _stages("default", "fast", 50)[0].points == _stages("default", "default", 50)[0].points == 50
+
+
+def test_normals_that_leave_the_plane_are_left_out_of_flat_clouds(rng):
+    points, up = np.c_[rng.random((9, 2)), np.zeros(9)], np.tile([0.0, 0.0, 1.0], (9, 1))
+    assert all(cloud.normals is None for cloud in common_dimension(*[Cloud(points, up)] * 2))
+    along = common_dimension(*[Cloud(points, up[:, [2, 1, 0]])] * 2)
+    assert all(cloud.normals.tolist() == [[1.0, 0.0]] * 9 for cloud in along)
+
+
+def test_deviations_of_turns_are_in_degrees():
+    turn, slide = (Direction(turning, np.array([0.0, 0, 1]), 0.1, 1.0, False) for turning in (True, False))
+    assert _plain(turn)["deviation"] == pytest.approx(np.rad2deg(0.1)) and _plain(slide)["deviation"] == 0.1
+
+
+def test_people_read_of_the_weakest_direction(rng):
+    cloud = Cloud(rng.random((60, 3)) * [3, 2, 1])
+    found, told = register_clouds(cloud, Cloud(cloud.points + 0.01), start=np.eye(4)), io.StringIO()
+    show(Console(file=told, width=200), found, described(found, cloud, cloud), None)
+    assert found.registration.directions[0].words in told.getvalue()

@@ -288,3 +288,13 @@ def test_a_listed_point_that_is_nearer_denies_the_pair_without_a_look_up():
         search(at)
     back = search.items[0].back
     assert 0 < back.looked_up < 0.1 * back.searched  # 48 and 75 of 1723; 280 and 300 where nothing is denied
+
+
+def test_the_spacing_of_many_points_is_asked_all_over_their_order():
+    along = torch.cat((0.01 * torch.arange(4500), 100 + torch.arange(5500.0)))  # dense first, sparse the more
+    assert point_spacing(torch.stack((along, torch.zeros_like(along)), 1)).item() == pytest.approx(1.0, rel=1e-3)
+
+
+def test_exact_duplicates_are_looked_past_in_a_spacing():
+    points = torch.rand(50, 3, dtype=torch.float64)
+    assert torch.equal(point_spacing(points.repeat(3, 1)), point_spacing(points))

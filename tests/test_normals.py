@@ -70,3 +70,9 @@ def test_what_is_written_past_torch_is_seen():
         estimate_normals(points), point_spacing(points)
         write(points)
         assert torch.equal(estimate_normals(points), wanted[0]) and torch.equal(point_spacing(points), wanted[1])
+
+
+def test_padding_does_not_turn_normals():
+    points = torch.nn.functional.normalize(torch.randn(60, 3, dtype=torch.float64), dim=-1)
+    padded, mask = torch.cat((points, torch.full((60, 3), 50.0).double())), torch.arange(120) < 60
+    torch.testing.assert_close(estimate_normals(padded, mask=mask)[:60], estimate_normals(points))

@@ -145,3 +145,7 @@ def test_progress_is_told():
 def test_bad_input_is_refused_in_words(scans, settings, words):
     with pytest.raises(ValueError, match=words):
         occupancy_grid(scans, poses_2d((0, 0, 0)), **settings)
+
+
+def test_the_slab_is_at_least_a_cell_high():
+    assert occupancy_grid([np.array([[1.0, 0.0, 0.3]])], np.eye(4)[None], resolution=0.5).hits.sum() == 1

@@ -9,6 +9,7 @@ from scan_problems import in_the_world, random_batch, with_padding
 from bbr_layer import RigidMotion
 from models import REGISTRATION_TERMS, ScanBatch, TermSettings, buddy_term, edge_clouds, registration_term
 from models import corrected_poses as corrected
+from models.edge_clouds import misalignment
 
 # Every term, as (name, settings). A new term is a new row.
 TERMS = {
@@ -273,3 +274,15 @@ def test_wrong_settings_are_refused_in_words(name, settings, words):
 def test_progress_beyond_the_end_is_refused_in_words(row):
     with pytest.raises(ValueError, match="fraction is 1.5"):
         build(row, 1.5)
+
+
+def test_the_misalignment_has_no_gradient():
+    distances = torch.rand(2, 5, requires_grad=True)
+    assert not misalignment(distances, torch.ones(2, 5, dtype=torch.bool)).requires_grad
+
+
+@pytest.mark.parametrize("row", ["geman_mcclure", "softBBS", "softBD", "N", "F"])
+def test_scans_each_in_one_place_have_a_finite_term(row):
+    batch = measured(random_batch(2))
+    batch = batch._replace(points=batch.points[:, :1].expand_as(batch.points).clone(), spacing=None)
+    assert value(build(row, 1.0), batch).isfinite()

@@ -71,3 +71,8 @@ def test_planar_scans_are_not_spoken_of_and_heights_that_differ_stay(rng):
     for other in (at_zero + [0, 0, 1e-4], at_zero + 1e-4 * rng.normal(size=(len(room), 1))):
         kept, notes = without_height([at_zero, other])
         assert kept[1] is other and notes == []
+
+
+def test_returns_of_nothing_do_not_make_what_was_seen_far():
+    scan = np.concatenate((np.zeros((100, 2)), 1 + np.random.default_rng(0).random((20, 2))))
+    assert without_far_points([scan, scan], ["a", "b"])[1] == []

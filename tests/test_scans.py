@@ -154,3 +154,9 @@ def test_the_fingerprint_follows_points_and_starting_poses_alone(folder):
     moved = [points + (number == 4) * 1e-9 for number, points in enumerate(scans.points)]
     assert dataclasses.replace(scans, points=moved).fingerprint() != scans.fingerprint()
     assert dataclasses.replace(scans, start=planar_poses(turns(12), "")).fingerprint() != scans.fingerprint()
+
+
+def test_far_poses_are_planar_to_the_digits_of_a_file():
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = [1e6, 0.0, 1.0]
+    assert planar_poses(poses, "start")[1, 0, 2] == 1e6

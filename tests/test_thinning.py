@@ -141,3 +141,15 @@ def test_settings_of_a_stage_that_cannot_work_are_refused(as_a_user):
         Stage(BuddyFilter(), dimension=4)
     with pytest.raises(ValueError, match="no stage of the layer is for 2D clouds of up to 9 points"):
         BBRLayer(Stage(BuddyFilter(), dimension=3))(torch.rand(9, 2), torch.rand(9, 2))
+
+
+def test_nearly_all_points_are_thinned_to_nearly_as_many_as_asked(rng):
+    assert len(evenly_thinned(rng.random((3000, 3)), 2850)) > 0.7 * 2850  # without the least growth: 1
+    grid = np.stack(np.meshgrid(*[np.arange(11.0)] * 3), -1).reshape(-1, 3)
+    assert len(evenly_thinned(grid, 1264)) > 0.7 * 1264  # without the way back between two guesses: 0.58
+
+
+def test_a_point_far_off_leaves_a_grid_with_more_cells_than_numbers(rng):
+    points = rng.random((3000, 3))
+    points[0] = 1e9
+    assert 500 < len(evenly_thinned(points, 1000)) <= 1000

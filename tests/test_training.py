@@ -203,3 +203,11 @@ def test_logs_for_people_and_programs(tmp_path):
     assert {"epoch", SCORE, MOVED, "loss/total", "loss/occupancy", "loss/registration"} <= set(lines[0].split(","))
     assert len(lines) == 3
     assert list((tmp_path / "logs" / "tensorboard" / "version_0").glob("events*"))
+
+
+def test_an_epoch_is_held_against_the_best_one_so_far(monkeypatch):
+    values = iter([1.0, 0.5, 0.8])
+    monkeypatch.setattr("train.training.MapScore", lambda *parts: lambda poses: next(values))
+    scans = small_world()
+    trained = train_map(scans, true_edges(scans), true_poses(scans), small_config(warm_up=0, settle=0, adjust=False))
+    assert trained.kept_epoch == 1

@@ -136,3 +136,10 @@ def test_nothing_wrong_is_written(tmp_path, world_from_scan, timestamps):
     with pytest.raises(ValueError, match="NaN or infinite"):
         write_poses_kitti(tmp_path / "a.txt", world_from_scan)
     assert os.listdir(tmp_path) == []
+
+
+def test_the_first_pose_that_is_no_motion_is_named(tmp_path):
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[2, :3, :3] = np.diag([1.0, 1.0, -1.0])
+    with pytest.raises(ValueError, match="number 2"):
+        write_poses_kitti(tmp_path / "p.txt", poses)

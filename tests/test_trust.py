@@ -10,8 +10,11 @@ from torch.func import vmap
 
 from bbr_layer import Adam, BBRLayer, CloudPair, Detached, RigidMotion, Status, register
 from bbr_layer.confidence import COEFFICIENTS
+from bbr_layer.directions import named
+from bbr_layer.matches import Matches, along_normals, summed
 from bbr_layer.preparation import prepared
 from bbr_layer.registration import StageResult, judged
+from bbr_layer.resistance import _agreed_hold
 from benchmarks.reliability import fitted, loaded
 from benchmarks.reliability_runs import read, row
 from benchmarks.reliability_trials import trials
@@ -164,3 +167,16 @@ def test_the_table_is_what_its_command_gives(real_data):
     for trial in [trial for trial in trials(4) if trial.points == 200][::16]:
         kept, found = rows[trial.name, "default"], row(trial, "default", layer)
         np.testing.assert_allclose(np.array(found[5:8], float), np.array(kept[5:8], float), atol=1e-3)
+
+
+def test_a_direction_that_nothing_is_known_of_has_no_deviation_and_no_negative_share():
+    assert all(np.isinf(one.deviation) for one in named(torch.eye(3).double(), 1.0, float("nan")))
+    assert named(torch.diag(torch.tensor([-0.1, 1.0, 1.0]).double()), 1.0, 0.1)[0].share == 0
+
+
+def test_the_error_of_the_hold_falls_with_the_root_of_the_patches():
+    a, b, arms = (torch.nn.functional.normalize(torch.randn(1, 32, 3).double(), dim=-1) for _ in range(3))
+    found = Matches(arms, a, b, torch.arange(32)[None], torch.ones(1, 32, dtype=torch.bool))
+    ones = torch.ones(1, 32).double()
+    both, apart = (summed(ones, along_normals(arms, part)) for part in found.normal_parts())
+    torch.testing.assert_close(_agreed_hold(arms, found, 8)[0], both - apart / 2)

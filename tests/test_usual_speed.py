@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from small_worlds import small_world, true_edges, true_poses
+from test_edges import _edges, _room
 
 from bbr_layer import RigidMotion
 from train import edges as edges_file
+from train import usual_speed as module
 from train.chain import consecutive
 from train.config import EdgeConfig
 from train.edges import register_edges
@@ -193,3 +195,22 @@ def test_pairs_of_the_window_across_a_replaced_step_are_registered_with_a_finite
     found = edges_file._registered(scene, pairs, true_poses(small_world()), replaced, silent)
     assert len(found.target) == len(pairs)
     assert asked == {(0, 2): True, (1, 3): True, (2, 4): False, (3, 5): False, (4, 6): True, (1, 4): False}
+
+
+def test_the_first_step_is_held_against_the_second(monkeypatch):
+    scans = _room(8)
+    steps = torch.tensor([[0.0, 0], [1, 0], [1, 0], [1, 0], [1, 0], [1, 0], [-1, 0]]).double()
+    pairs = [(i, i + 1) for i in range(len(steps))]
+    chain = _edges(RigidMotion.identity(2, (8,)), pairs)._replace(score=torch.full((7,), 0.8).double())
+    chain = chain._replace(target_from_source=RigidMotion(chain.target_from_source.rotation, steps))
+
+    def every_way(scene, edges, length, progress):
+        angles = torch.arange(module.DIRECTIONS).double() * (2 * np.pi / module.DIRECTIONS)
+        ways = length * torch.stack((angles.cos(), angles.sin()), -1)
+        tried = edges.kept(torch.zeros(module.DIRECTIONS, dtype=torch.int64))
+        return tried._replace(target_from_source=RigidMotion(tried.target_from_source.rotation, ways))
+
+    monkeypatch.setattr(module, "_in_all_directions", every_way)
+    found, replaced = module.at_usual_speed(build_scene(scans, prepare(scans, 180)), chain)
+    assert replaced.tolist() == [True] + [False] * 6
+    torch.testing.assert_close(found.target_from_source.translation[0], torch.tensor([1.0, 0.0]).double())
