@@ -109,3 +109,12 @@ def test_a_registered_edge_of_score_0_still_pulls():
     score[2] = 0.0
     pulls = _by_score(edges._replace(score=score)).information
     torch.testing.assert_close(pulls[2], FAINTEST**2 * edges.information[2])
+
+
+def test_where_most_scores_are_0_the_others_are_no_stronger_than_they_would_be():
+    edges = true_edges(SCANS)
+    score = torch.zeros_like(edges.score)
+    score[:3] = torch.tensor([0.4, 0.2, 0.2]).double()
+    pulls = _by_score(edges._replace(score=score)).information
+    torch.testing.assert_close(pulls[:2], torch.tensor([4.0, 1.0])[:, None, None] * edges.information[:2])
+    torch.testing.assert_close(pulls[3:], FAINTEST**2 * edges.information[3:])

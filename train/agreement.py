@@ -59,9 +59,15 @@ def _contradicted(scene: Scene, edges: Edges, poses: RigidMotion) -> bool:
 
 
 def _by_score(edges: Edges) -> Edges:
-    """The edges, each as strong as the square of its score over the median; given motions as they are."""
+    """The edges, each as strong as the square of its score over the median; given motions as they are.
+
+    Where most scores are 0, nothing fits, the median is of the others.
+    """
     registered = edges.kind != GIVEN
-    share = (edges.score / edges.score[registered].median().clamp(min=1e-300)).clamp(min=FAINTEST)
+    scores = edges.score[registered]
+    if (scores > 0).any() and scores.median() == 0:
+        scores = scores[scores > 0]
+    share = (edges.score / scores.median().clamp(min=1e-300)).clamp(min=FAINTEST)
     strength = torch.where(registered, share, 1.0).square()
     return edges._replace(information=strength[:, None, None] * edges.information)
 
