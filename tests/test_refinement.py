@@ -100,3 +100,9 @@ def test_points_without_weight_do_not_pull_as_targets_either():
     of_points[4][:] = 0
     found = tr.refine(scans, tr.EDGES[:, ::-1], start, (trust, of_points))
     assert np.array_equal(found[4], start[4]) and np.abs(found[:4] - truth[:4]).max() < 2e-3
+
+
+def test_without_an_edge_of_any_weight_the_poses_stay():
+    scans, truth = _box(2)
+    start, (trust, of_points) = _shaken(truth, 0.03), _alike(scans)
+    assert np.array_equal(refine(scans, EDGES, start, (np.zeros_like(trust), of_points)), start)

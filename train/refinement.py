@@ -49,6 +49,8 @@ def refine(
 ) -> Float[np.ndarray, "k d1 d1"]:
     """Poses ``(k, d + 1, d + 1)`` at which the mutual pairs of all edges agree; the first pose is kept.
 
+    Where no edge has weight all are kept.
+
     Parameters
     ----------
     scans: the k scans.
@@ -62,6 +64,8 @@ def refine(
     spacing = min(scan.spacing for scan in scans)
     d = poses.shape[1] - 1
     used = weights[0] > 0
+    if not used.any():
+        return poses
     edges, trust = edges[used], weights[0][used]
     for step in range(STEPS):
         progress("refinement", step, STEPS)
