@@ -1,6 +1,7 @@
 """The functional twin of the layer, for tensors and numpy arrays alike."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -98,6 +99,8 @@ def _of_one_type(given: Mapping[str, Array | RigidMotion]) -> dict[str, torch.Te
 
 
 def _numbers(name: str, given: Array) -> np.ndarray:
+    if isinstance(given, str | Path):
+        raise ValueError(f"{name} is a file's name, {str(given)!r}: give what read_cloud reads from it")
     try:
         array = np.asarray(given)
     except ValueError as error:

@@ -1,5 +1,7 @@
 """The functional twin: arrays of any kind, clouds as they are read, a matrix to begin at, and motions of arrays."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -159,3 +161,11 @@ def test_a_tensor_beside_an_array_is_answered_in_tensors(tensor):
     torch.testing.assert_close(found.target_from_source.matrix.detach(), plain.target_from_source.matrix)
     found.target_from_source.matrix.square().sum().backward()
     assert mixed[tensor].grad.isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["scan.ply", Path("scan.ply")])
+def test_a_files_name_is_no_cloud(name, as_a_user):
+    with pytest.raises(ValueError, match="^Q is a file's name, 'scan.ply': give what read_cloud reads from it$"):
+        register(bumpy(20, 3).numpy(), name)
+    with pytest.raises(ValueError, match="^Q is a file's name, 'scan.ply'"):
+        register(bumpy(20, 3), name)
