@@ -167,7 +167,8 @@ class BBRLayer(nn.Module):
         motion = begun_at(start, pair, frame, self.scaled)
         stages = [stage for stage in self.sequence if stage.wanted(pair)]
         if not stages:
-            shown = f"{pair.P.shape[-1]}D clouds of up to {max(pair.P.shape[1], pair.Q.shape[1])} points"
+            most = int(torch.maximum(*pair.real_counts()).max())
+            shown = f"{pair.P.shape[-1]}D clouds of up to {most} points"
             raise ValueError(f"no stage of the layer is for {shown}: look at its dimension, above and upto")
         starts = self.starts or (ROBUST_STARTS if start is None and stages[0].dimension == 2 else 1)
         if starts > 1:

@@ -192,3 +192,5 @@ def test_padding_does_not_decide_which_stages_run():
 def test_a_size_that_no_stage_is_for_is_named(as_a_user):
     with pytest.raises(ValueError, match="no stage of the layer is for 3D clouds of up to 60 points: look at its dim"):
         BBRLayer(Stage(SoftBD(), upto=50))(bumpy(40, 3), bumpy(60, 3))
+    with pytest.raises(ValueError, match="clouds of up to 55 points"):
+        BBRLayer(Stage(SoftBD(), upto=50))(bumpy(40, 3), bumpy(60, 3), Q_mask=torch.arange(60) < 55)
