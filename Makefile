@@ -40,6 +40,6 @@ $(INSTALLED): pyproject.toml constraints.txt
 		{ echo "Python 3.11 or newer is needed; name one with PYTHON=..., as in: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 2; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv --clear $(VENV)
 	@echo "Installing into $(VENV): once, and a few minutes where torch has to be downloaded."
-	@# --no-compile: what is imported is compiled then; all of it took as long as the rest of the installation.
+	@# --no-compile: what is imported is compiled then; to compile everything here takes long, and most is never imported.
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[train,las,dev]'
 	@touch $@

@@ -46,8 +46,8 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
     tensor = next((x for x in (P, Q) if isinstance(x, torch.Tensor)), None)
     for side, cloud in (("P", P), ("Q", Q)):
         if isinstance(cloud, Cloud) and cloud.normals is not None:
-            given.setdefault(f"{side}_normals", _like(tensor, cloud.normals))
-    P, Q = (_like(tensor, x.points) if isinstance(x, Cloud) else x for x in (P, Q))
+            given.setdefault(f"{side}_normals", cloud.normals)
+    P, Q = (x.points if isinstance(x, Cloud) else x for x in (P, Q))
     unknown = sorted(given.keys() - GIVEN)
     if unknown:
         known = ", ".join(sorted(GIVEN))
@@ -63,11 +63,6 @@ def register(P: Points, Q: Points, *, layer: BBRLayer | None = None, **given: Ar
         return chosen(**{name: _beside(tensor, name, x) for name, x in {"P": P, "Q": Q, **given}.items()})
     answer: Registration = arrays(chosen(**_of_one_type({"P": P, "Q": Q, **given})))
     return answer
-
-
-def _like(tensor: torch.Tensor | None, array: np.ndarray) -> Array:
-    """What a file gave as a tensor of the kind of the other cloud, where that is one."""
-    return array if tensor is None else from_array(array).to(tensor)
 
 
 def _beside(tensor: torch.Tensor, name: str, given: Array | RigidMotion | None) -> torch.Tensor | RigidMotion | None:

@@ -41,13 +41,18 @@ def write(path: Path, rows: dict[tuple[str, str], list[str]]) -> None:
 def row(trial: Trial, name: str, layer: BBRLayer) -> list[str]:
     """One registration: its errors (displacement as a share of the source's radius) and its pairs' shares."""
     c = clouds(trial)
-    given = CloudPair._make(None if x is None else x.float()[None] for x in (c.P, c.Q, *c[3:], *[None] * 7))
+    given = as_pair(c)
     motion = layer(given.P, given.Q, P_normals=given.P_normals, Q_normals=given.Q_normals).target_from_source
     frame, pair = prepared(given, needs_normals=True, scaled=True)
     entered, seen = frame.enter(motion), judged_clouds(pair)
     shares = statistics(seen, matched(seen, entered))[0].tolist()
     numbers = (*errors(c, motion.item(0)), *shares, _close_share(c, motion.item(0)))
     return [trial.group, trial.name, name, *(f"{number:.4g}" for number in numbers)]
+
+
+def as_pair(c: Clouds) -> CloudPair:
+    """The clouds and their normals as the layer computes with them: a batch of one, float32."""
+    return CloudPair._make(None if x is None else x.float()[None] for x in (c.P, c.Q, *c[3:], *[None] * 7))
 
 
 def errors(c: Clouds, motion: RigidMotion) -> tuple[float, float]:

@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbr_layer import BBRLayer, CloudPair, Detached, RigidMotion, atomic_write
+from bbr_layer import BBRLayer, Detached, RigidMotion, atomic_write
 from bbr_layer.confidence import fit_elsewhere, judged_clouds, point_gaps
 from bbr_layer.preparation import prepared
+from bbr_layer.verdict import BELIEVED
+from benchmarks.reliability_runs import as_pair
 from benchmarks.reliability_trials import Trial, clouds, trials
 
 SIZES = (120, 300, 800, 2000, 5000)
@@ -55,8 +57,7 @@ def believed(volume: Callable[[int], Tensor], n: int, repeats: int) -> tuple[lis
 def logits_elsewhere(trial: Trial) -> float:
     """Of a trial's true answer."""
     c = clouds(trial)
-    given = CloudPair._make(None if x is None else x.float()[None] for x in (c.P, c.Q, *c[3:], *[None] * 7))
-    frame, pair = prepared(given, needs_normals=True, scaled=True)
+    frame, pair = prepared(as_pair(c), needs_normals=True, scaled=True)
     truth = RigidMotion(c.truth.rotation.double()[None], c.truth.translation.double()[None])
     seen = judged_clouds(pair)
     return fit_elsewhere(seen, frame.enter(truth), point_gaps(seen)).item()
@@ -69,7 +70,7 @@ def volumes_table(repeats: int) -> list[str]:
         cells = []
         for n in SIZES:
             strangers, copies = believed(volume, n, repeats)
-            wrong = sum(x > 0.5 for x in strangers)
+            wrong = sum(x > BELIEVED for x in strangers)
             cells.append(f"{wrong}/{repeats}, {np.median(strangers):.2f}; {min(copies):.2f}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
         print(lines[-1], flush=True)
@@ -94,8 +95,8 @@ def main() -> None:
     torch.set_num_threads(1)
     lines = [
         f"Made by `python -m benchmarks.volumes --repeats {options.repeats}`, `BBRLayer()`. Of clouds with nothing in",
-        "common: how many are believed (confidence over 0.5) and their median confidence; after the semicolon the",
-        f"least confidence of a cloud and its copy with noise of {NOISE}.",
+        f"common: how many are believed (confidence over {BELIEVED}) and their median confidence; after the semicolon",
+        f"the least confidence of a cloud and its copy with noise of {NOISE}.",
         "",
         *volumes_table(options.repeats),
         "",

@@ -1,7 +1,7 @@
 """torch's checks of gradients by differences, with the shapes checked once.
 
-They call a function hundreds of times with inputs of the same shapes, and the checks of shapes take three quarters
-of the time of such a test.
+They call a function hundreds of times with inputs of the same shapes, and the checks of shapes take most of
+the time of such a test.
 """
 
 from collections.abc import Iterator

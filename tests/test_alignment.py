@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import test_alignment as ta
 import torch
 from small_worlds import displaced, small_world, true_edges, true_poses
 
@@ -66,7 +65,7 @@ def test_the_kernel():
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_edges_that_the_poses_meet_cost_nothing_either_way_round(dimension, monkeypatch):
     scans = small_world(dimension)
-    score, poses = ta.score_of(scans, true_edges(scans)), true_poses(scans)
+    score, poses = score_of(scans, true_edges(scans)), true_poses(scans)
     whole = score(poses)
     monkeypatch.setattr("train.alignment.EDGE_WEIGHT", 0.0)
     assert score(poses) == pytest.approx(whole, abs=1e-9)

@@ -13,6 +13,7 @@ from bbr_layer.ellipsoid import half_turned, turned_within
 from bbr_layer.losses import BuddyFilter, SoftBD
 from bbr_layer.matches import matched
 from bbr_layer.preparation import prepared
+from benchmarks.volumes import VOLUMES
 
 STILL = RigidMotion.identity(3)
 
@@ -50,24 +51,6 @@ def test_padding_is_no_duplicate():
 def test_few_points_are_believed_little_whatever_they_say(n):
     P, Q = torch.rand(n, 3), torch.rand(300, 3)
     assert 0 <= BBRLayer.fast()(P, Q).confidence <= n / 100
-
-
-def _in_ball(n, d):
-    directions = torch.nn.functional.normalize(torch.randn(n, d), dim=-1)
-    return directions * torch.rand(n, 1) ** (1 / d)
-
-
-VOLUMES = {
-    "ball": lambda n: _in_ball(n, 3),
-    "cube": lambda n: torch.rand(n, 3),
-    "normal": lambda n: torch.randn(n, 3),
-    "disc": lambda n: _in_ball(n, 2),
-    "rod": lambda n: torch.rand(n, 3) * torch.tensor([6.0, 1.0, 1.0]),
-    "slab": lambda n: torch.rand(n, 3) * torch.tensor([8.0, 8.0, 1.0]),
-    "plank": lambda n: torch.rand(n, 3) * torch.tensor([8.0, 3.0, 1.0]),
-    "cigar": lambda n: torch.randn(n, 3) * torch.tensor([4.0, 1.0, 1.0]),
-    "strip": lambda n: torch.rand(n, 2) * torch.tensor([6.0, 1.0]),
-}
 
 
 @pytest.mark.parametrize("volume", VOLUMES)
@@ -110,7 +93,7 @@ def test_the_look_elsewhere_takes_nothing_from_a_surface(surface):
 
 
 def test_a_surface_is_believed_the_same_beside_a_volume():
-    P, Q = (torch.stack((_street(500), VOLUMES["rod"](500))) for _ in range(2))
+    P, Q = (torch.stack((_street(500), VOLUMES["rod, 6 x 1 x 1"](500))) for _ in range(2))
     street, rod = confidence(*_where_they_lie(P, Q))
     torch.testing.assert_close(street, confidence(*_where_they_lie(P[:1], Q[:1]))[0])
     assert street > 0.9 and rod < 0.5

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import test_refinement as tr
 import torch
 
 from bbr_layer import RigidMotion
@@ -88,17 +87,17 @@ def test_scans_that_no_edge_joins_to_the_first_stay_where_they_are_as_a_whole(d)
 def test_the_side_that_normals_point_to_plays_no_part(d):
     found = []
     for sign in (1.0, -1.0):
-        scans, truth = tr._box(d)
+        scans, truth = _box(d)
         scans[1].normals[...] *= sign
-        found.append(tr.refine(scans, tr.EDGES, tr._shaken(truth, 0.03), tr._alike(scans)))
+        found.append(refine(scans, EDGES, _shaken(truth, 0.03), _alike(scans)))
     np.testing.assert_allclose(*found, atol=1e-9)
 
 
 def test_points_without_weight_do_not_pull_as_targets_either():
-    scans, truth = tr._box(2)
-    start, (trust, of_points) = tr._shaken(truth, 0.03), tr._alike(scans)
+    scans, truth = _box(2)
+    start, (trust, of_points) = _shaken(truth, 0.03), _alike(scans)
     of_points[4][:] = 0
-    found = tr.refine(scans, tr.EDGES[:, ::-1], start, (trust, of_points))
+    found = refine(scans, EDGES[:, ::-1], start, (trust, of_points))
     assert np.array_equal(found[4], start[4]) and np.abs(found[:4] - truth[:4]).max() < 2e-3
 
 

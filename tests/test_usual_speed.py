@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from small_worlds import small_world, true_edges, true_poses
-from test_edges import _edges, _room
 
 from bbr_layer import RigidMotion
 from train import edges as edges_file
@@ -198,11 +197,12 @@ def test_pairs_of_the_window_across_a_replaced_step_are_registered_with_a_finite
 
 
 def test_the_first_step_is_held_against_the_second(monkeypatch):
-    scans = _room(8)
+    scans = small_world()
     steps = torch.tensor([[0.0, 0], [1, 0], [1, 0], [1, 0], [1, 0], [1, 0], [-1, 0]]).double()
-    pairs = [(i, i + 1) for i in range(len(steps))]
-    chain = _edges(RigidMotion.identity(2, (8,)), pairs)._replace(score=torch.full((7,), 0.8).double())
-    chain = chain._replace(target_from_source=RigidMotion(chain.target_from_source.rotation, steps))
+    edges = true_edges(scans)
+    chain = edges.kept(edges.source == edges.target + 1)
+    motion = RigidMotion(chain.target_from_source.rotation, steps)
+    chain = chain._replace(target_from_source=motion, score=torch.full((len(steps),), 0.8).double())
 
     def every_way(scene, edges, length, progress):
         angles = torch.arange(module.DIRECTIONS).double() * (2 * np.pi / module.DIRECTIONS)
