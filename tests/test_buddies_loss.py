@@ -166,6 +166,7 @@ def test_nothing_is_warned_of_where_no_gradient_is_right(name, recwarn):
     P = noisy_pair(3)["P"]
     BestBuddiesLoss(name, 0.01)(P, P)
     BestBuddiesLoss(name)(P, P + 1000, P_weights=torch.zeros(P.shape[:-1]).double())
+    BestBuddiesLoss(name)(P, P + 1000, Q_mask=torch.zeros(P.shape[:-1], dtype=torch.bool))
     assert not recwarn.list
 
 
